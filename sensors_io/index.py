@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from typing import Any, Self
 
 from sensors_io.codec import CorruptRecordsError, RecordsError
+from sensors_io.errors import MALFORMED
 from sensors_io.json_files import seal, unseal
 from sensors_io.schema import ContactKey
 from sensors_io.shards import Shard
@@ -88,7 +89,7 @@ class Index:
             raise RecordsError(
                 f"{path} cannot be read ({error}); make it readable, or copy it again from its source"
             ) from error
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
+        except MALFORMED as error:
             raise CorruptRecordsError(f"{path} is damaged ({error!r}); delete {root} and write it again") from error
         raise RecordsVersionError(
             f"{path} is {found[0]!r} version {found[1]!r}, this code reads {FORMAT!r} versions {READABLE}; "

@@ -51,7 +51,10 @@ def unseal(text: str) -> Any:
     Raises:
       ValueError: it is no JSON, or its checksum does not hold.
     """
-    value, text = json.loads(text), text.rstrip()
+    try:
+        value, text = json.loads(text), text.rstrip()
+    except RecursionError as error:
+        raise ValueError("it nests too deeply") from error
     end = text.rfind('"')
     start, stated = text.rfind('"', 0, max(end, 0)), _VALUE.fullmatch(text, end + 1)
     if start < 0 or stated is None or not isinstance(value, dict):

@@ -5,7 +5,7 @@ import pathlib
 from collections.abc import Mapping
 from typing import Self
 
-from sensors_io.errors import UserError
+from sensors_io.errors import MALFORMED, UserError
 from sensors_io.json_files import read_json, write_json
 
 
@@ -58,16 +58,16 @@ class Offsets:
         """Read what `save` wrote.
 
         Raises:
-          OffsetsError: a field is missing or of another kind.
+          OffsetsError: there is no such file, or a field is missing or of another kind.
         """
         try:
             tree = read_json(path)
             sensors = {str(name): Offset(**offset) for name, offset in tree["sensors"].items()}
             late_s = [float(offset.late_s) for offset in sensors.values()]
-            if any(abs(late) > LARGEST_S for late in late_s):
+            if not all(abs(late) <= LARGEST_S for late in late_s):
                 raise ValueError(f"late_s are {late_s}: must lie within ±{LARGEST_S} s")
             return cls(reference=str(tree["reference"]), sensors=sensors)
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except (OSError, *MALFORMED) as error:
             raise OffsetsError(f"{path} holds no offsets ({error!r}); make them with `sync`") from error
 
 

@@ -12,6 +12,7 @@ from typing import Self
 import numpy as np
 
 from sensors_io.clock import NS_PER_S
+from sensors_io.errors import MALFORMED
 from sensors_io.force import ForceError, GravityModel, fit_gravity, gravity_directions
 from sensors_io.json_files import read_json, write_json
 
@@ -108,17 +109,18 @@ class ForceZero:
         """Read what `save` wrote.
 
         Raises:
-          ForceError: a field is missing or is no number.
+          ForceError: there is no such file, or a field is missing or is no finite number.
         """
         try:
             tree = read_json(path)
             tree = {name: np.array(v, np.float64) if isinstance(v, list) else v for name, v in tree.items()}
             down = tree.pop("down").reshape(3)
-            model = GravityModel(**tree)
-            if any(v.shape != (3,) for v in (model.bias_n, model.bias_nmm, model.first_moment_nmm)):
-                raise ValueError("its vectors must have three numbers")
+            model = GravityModel(**{**tree, "weight_n": float(tree["weight_n"])})
+            for v in (model.bias_n, model.bias_nmm, model.first_moment_nmm, down):
+                if v.shape != (3,) or not np.isfinite(v).all():
+                    raise ValueError("its vectors must have three finite numbers")
             return cls(model=model, down=down)
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except (OSError, *MALFORMED) as error:
             raise ForceError(f"{path} holds no gravity model ({error!r}); make one with `force-zero`") from error
 
 

@@ -311,9 +311,15 @@ def clip_arrays(touch: TouchInput, saved: SavedPolicy) -> dict[str, np.ndarray]:
     """The arrays of `TouchBatch` for one touch, without P: pictures resized, absent streams and frames masked.
 
     Raises:
-      QuestionError: no sensor or an unknown one, arrays of other shapes, or more frames than the policy reads.
+      QuestionError: no sensor or an unknown one, arrays of other shapes or types, numbers that are not finite, or more
+        frames than the policy reads.
     """
     model, sensors = saved.model, saved.sensors
+    unfelt = sorted((touch.force_n.keys() | touch.index.keys()) - touch.frames.keys())
+    if unfelt:
+        raise QuestionError(
+            f"force_n and index are of {', '.join(unfelt)}: must be of sensors with frames; rename them"
+        )
     unknown = sorted(touch.frames.keys() - {*sensors})
     if unknown or not touch.frames:
         raise QuestionError(
@@ -334,23 +340,38 @@ def clip_arrays(touch: TouchInput, saved: SavedPolicy) -> dict[str, np.ndarray]:
         if sensor not in touch.frames:
             continue
         frames = np.asarray(touch.frames[sensor])
-        n = len(frames)
-        if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[-1] != 3 or not 1 <= n <= model.frames:
+        n = len(frames) if frames.ndim == 4 else 0
+        if not all(map(_is_picture, frames)) or not 1 <= n <= model.frames:
             raise QuestionError(
                 f"frames[{sensor}] are {frames.dtype}{list(frames.shape)}: must be uint8 [F, H, W, 3] with 1 ≤ F ≤ "
                 f"{model.frames}; choose frames that cover the contact, as sensors_io.selection.choose_frames does"
             )
-        force, index = touch.force_n.get(sensor, np.zeros((n, 3))), touch.index.get(sensor, np.arange(n))
+        force, index = (
+            np.asarray(given.get(sensor, default))
+            for given, default in ((touch.force_n, np.zeros((n, 3))), (touch.index, np.arange(n)))
+        )
         if np.shape(force) != (n, 3) or np.shape(index) != (n,):
             raise QuestionError(
                 f"force_n[{sensor}] and index[{sensor}] are {np.shape(force)} and {np.shape(index)}: must be "
                 f"({n}, 3) and ({n},) for {n} frames; align them"
             )
+        if not np.isfinite(force).all() or index.dtype.kind not in "iu" or index.min() < 0:
+            raise QuestionError(
+                f"force_n[{sensor}] and index[{sensor}] must be finite numbers and whole numbers ≥ 0; leave a force "
+                "out that was not measured"
+            )
         of["frames"][s, :n] = [_resized(frame, model.image_px) for frame in frames]
         of["force_n"][s, :n], of["frame_index"][s, :n], of["frame_mask"][s, :n] = force, index, True
     if touch.view is not None:
-        of["view"] = _resized(np.asarray(touch.view), model.vision.image_px)
+        view = np.asarray(touch.view)
+        if not _is_picture(view):
+            raise QuestionError(f"view is {view.dtype}{list(view.shape)}: must be RGB uint8 [H, W, 3]; convert it")
+        of["view"] = _resized(view, model.vision.image_px)
     return of
+
+
+def _is_picture(image: np.ndarray) -> bool:
+    return image.dtype == np.uint8 and image.ndim == 3 and image.shape[-1] == 3 and image.size > 0
 
 
 def _resized(image: np.ndarray, px: int) -> np.ndarray:

@@ -119,7 +119,10 @@ class ExportCommand(Places):
         saved = find_policy(self.policy, self.runs_dir).saved
         figures = measured_figures(self.policy, self.runs_dir)
         saved = dataclasses.replace(saved, notes={**saved.notes, **figures})
-        card = "" if self.card is None else self.card.read_text(encoding="utf-8")
+        try:
+            card = "" if self.card is None else self.card.read_text(encoding="utf-8")
+        except UnicodeDecodeError as error:
+            raise DataError(f"card is {self.card}: must be text in UTF-8 ({error}); convert it") from error
         if self.folder.startswith(HUB):
             print_lines(push(saved, self.folder.removeprefix(HUB), precision=self.precision, card=card))
             return 0

@@ -2,6 +2,7 @@
 
 import contextlib
 import http.server
+import re
 import tempfile
 import threading
 import urllib.parse
@@ -14,7 +15,7 @@ from experiments.ask.inputs import GENERATED, read_touch
 from experiments.ask.page import answered_part
 from experiments.core.report import ENVIRONMENT
 from sensors_io.errors import UserError
-from sensors_io.viewer.server import LimitedServer, names_this_machine
+from sensors_io.viewer.server import LimitedServer, names_this_machine, split_target
 from touchr1_jax.asking import AskablePolicy
 from touchr1_jax.text.plain_questions import QuestionError
 
@@ -56,7 +57,7 @@ class DemoHandler(http.server.BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """The page, or the answers about a generated object."""
-        split = urllib.parse.urlsplit(self.path)
+        split = split_target(self.path)
         words = urllib.parse.parse_qs(split.query).get("words", [""])[0]
         if not self._admitted():
             return
@@ -69,18 +70,23 @@ class DemoHandler(http.server.BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         """The answers about a video, which is the body of the request."""
-        split = urllib.parse.urlsplit(self.path)
+        split = split_target(self.path)
         asked = {name: values[0] for name, values in urllib.parse.parse_qs(split.query).items()}
         if not self._admitted():
             return
         length = self.headers.get("Content-Length", "")
-        if split.path != "/video" or not length.isdigit() or int(length) > MOST_BYTES:
+        if split.path != "/video" or not re.fullmatch("[0-9]{1,12}", length) or int(length) > MOST_BYTES:
             self.close_connection = True
             self._reply(f"a video of at most {MOST_BYTES // 2**20} MB is expected", status=413)
             return
+        video = self.rfile.read(int(length))
+        if len(video) < int(length):
+            self._reply(f"the video was cut off, {len(video)} bytes of {length}; send it again", status=400)
+            return
         with tempfile.TemporaryDirectory() as home:
-            path = Path(home) / f"video{Path(asked.get('name', '')).suffix[:8]}"
-            path.write_bytes(self.rfile.read(int(length)))
+            suffix = re.search(r"\.[A-Za-z0-9]{1,7}$", asked.get("name", ""))
+            path = Path(home) / f"video{suffix[0] if suffix else ''}"
+            path.write_bytes(video)
             self._answer(path, asked.get("sensor", ""))
 
     def log_message(self, format: str, *args: object) -> None:
@@ -107,8 +113,7 @@ class DemoHandler(http.server.BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(len(content)))
         self.send_header("Cache-Control", "no-store")
         self.end_headers()
-        with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # the browser was closed
-            self.wfile.write(content)
+        self.wfile.write(content)
 
 
 @contextlib.contextmanager

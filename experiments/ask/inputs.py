@@ -91,17 +91,24 @@ def _generated(which: str, saved: SavedPolicy) -> AskedTouch:
     known = {word: (name, level) for name in ATTRIBUTES for level, word in enumerate(words(saved, name))}
     given = dict(saved.notes.get(SCENES) or {})
     fields = {field.name for field in dataclasses.fields(SceneConfig)} & given.keys() - {"split_shares"}
-    config = SceneConfig(**{name: given[name] for name in fields} | {"objects": 1, "sites": 1, "sequences": None})
+    try:
+        config = SceneConfig(**{name: given[name] for name in fields} | {"objects": 1, "sites": 1, "sequences": None})
+    except (TypeError, ValueError) as error:
+        raise DataError(
+            f"policy notes scenes that this version cannot generate ({error}); give another input"
+        ) from error
     wanted: dict[str, int] = {}
-    for word in filter(None, which.split(",")) if not which.isdigit() else ():
+    counted = re.fullmatch("[0-9]{1,9}", which) is not None
+    for word in filter(None, which.split(",")) if not counted else ():
         if word not in known:
             raise DataError(
-                f"input is {GENERATED}:{which}: {word!r} is no property; choose from {', '.join(known)}, or a number"
+                f"input is {GENERATED}:{which}: {word!r} is no property; choose from {', '.join(known)}, or a number "
+                "of nine digits at most"
             )
         name, level = known[word]
         if wanted.setdefault(name, level) != level:
             raise DataError(f"input is {GENERATED}:{which}: an object has one {name}; drop a word")
-    first = int(which) if which.isdigit() else int(np.random.default_rng().integers(UNSEEN_SEED))
+    first = int(which) if counted else int(np.random.default_rng().integers(UNSEEN_SEED))
     for number in itertools.islice(itertools.count(first), MOST_DRAWN):
         scene = dataclasses.replace(config, seed=UNSEEN_SEED + number)
         if wanted.items() <= solid_of(scene, 0).labels().items():

@@ -111,7 +111,8 @@ def run_policy(name: str, runs_dir: Path) -> Path | None:
             run = runs.locate(str(Path(*parts[:count])), runs_dir)
         except FileNotFoundError:
             continue
-        if "experiment" not in read_json(run / "config.json"):
+        described = read_json(run / "config.json")
+        if not isinstance(described, dict) or "experiment" not in described:
             return None  # the config.json of a policy itself
         arm, seed = [*parts[count:], *["sft", "0"][len(parts) - count :]]
         folder = run / POLICIES / arm / seed
@@ -124,7 +125,14 @@ def run_policy(name: str, runs_dir: Path) -> Path | None:
 
 
 def clip_of(saved: SavedPolicy) -> ClipConfig:
-    """The clips that a policy reads."""
+    """The clips that a policy reads.
+
+    Raises:
+      PolicyError: it leaves out frames by a flag that this version does not know.
+    """
+    unknown = sorted({*saved.reads.rejected} - {*Flag.__members__})
+    if unknown:
+        raise PolicyError(f"policy leaves out frames with the flags {', '.join(unknown)}: unknown; update touchr1-jax")
     return ClipConfig(
         frames=saved.model.frames,
         image_px=saved.model.image_px,

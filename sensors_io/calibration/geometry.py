@@ -24,8 +24,8 @@ import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
-from sensors_io.errors import UserError
-from sensors_io.json_files import write_json
+from sensors_io.errors import MALFORMED, UserError
+from sensors_io.json_files import read_json, write_json
 
 _FOLDS = 9
 _INVERSIONS = 25  # Newton steps on the radius; six do where the pins are, the rest is for the far corners
@@ -114,17 +114,22 @@ class CameraGeometry:
           GeometryError: there is no such file, or it is something else.
         """
         try:
-            tree = json.loads(path.read_text())
+            tree = read_json(path)
             rows, columns = tree["size_px"]
-            return cls(
-                size_px=(rows, columns),
+            found = cls(
+                size_px=(int(rows), int(columns)),
                 centre_px=np.array(tree["centre_px"], np.float64),
                 radial=np.array(tree["radial"], np.float64),
                 homography=np.array(tree["homography"], np.float64),
                 rms_mm=float(tree["rms_mm"]),
                 held_out_mm=float(tree["held_out_mm"]),
             )
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            shapes = (2,), (2,), (3, 3)
+            for array, shape in zip((found.centre_px, found.radial, found.homography), shapes, strict=True):
+                if array.shape != shape or not np.isfinite(array).all():
+                    raise ValueError(f"its arrays must be finite, of shapes {shapes}")
+            return found
+        except (OSError, *MALFORMED) as error:
             raise GeometryError(
                 f"{path} is no geometry ({error}); make one with `python -m sensors_io geometry`"
             ) from error

@@ -44,6 +44,8 @@ class ColourMap:
         if self.weights.shape != want or self.weights.dtype != np.float32:
             got = f"{self.weights.dtype}{list(self.weights.shape)}"
             raise ValueError(f"weights is {got}: must be float32{list(want)}; fit it anew")
+        if not np.isfinite(self.weights).all():
+            raise ValueError("weights holds numbers that are not finite: must be finite; fit it anew")
 
 
 class SlopeReader:

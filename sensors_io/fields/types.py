@@ -16,7 +16,7 @@ from typing import Any, Self
 import numpy as np
 
 from sensors_io.arrays import load_arrays
-from sensors_io.errors import UserError
+from sensors_io.errors import MALFORMED, UserError
 from sensors_io.fields.slopes import ColourMap
 from sensors_io.schema import SchemaError, Spec, check_arrays
 
@@ -132,7 +132,7 @@ class Calibration:
             degrees = {name: plain.pop(name) for name in ("degree", "position_degree")}
             stated = plain.pop("hash")
             found = cls(background=background, colours=ColourMap(weights=weights, **degrees), **plain)
-        except (KeyError, TypeError, ValueError) as error:
+        except MALFORMED as error:
             raise CalibrationError(
                 f"{path} is no calibration ({error}); make one with `python -m sensors_io calibrate`"
             ) from error

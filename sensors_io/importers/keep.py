@@ -7,6 +7,9 @@ import numpy as np
 
 from sensors_io.errors import UserError
 
+WIDEST = 100
+"""Columns for each row of a picture that is brought to a number of rows."""
+
 
 class ImportSourceError(UserError, ValueError):
     """A source that cannot be imported; the message names the path, the problem and the fix."""
@@ -61,7 +64,14 @@ class Keep:
         return [kept[start : start + size] for start in range(0, len(kept), size)]
 
     def shrink(self, image: np.ndarray) -> np.ndarray:
-        """The image at `height` rows, uint8 [H, W, 3]."""
+        """The image at `height` rows, uint8 [H, W, 3].
+
+        Raises:
+          UnreadableError: one that is so wide that it would get larger than any picture.
+        """
+        rows, columns = image.shape[:2]
+        if columns > WIDEST * rows:
+            raise UnreadableError(f"has {rows} × {columns} pixels, more than {WIDEST} columns for each row")
         return at_height(image, self.height)
 
 

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from sensors_io.errors import MALFORMED
 from sensors_io.importers.catalogue import Catalogue, Listed, Taken, fingerprint, require_files
 from sensors_io.importers.keep import ImportSourceError, Keep, Skip
 from sensors_io.importers.pictures import film, natural, nominal_ns, numbered, read_pictures
@@ -59,7 +60,7 @@ def list_octopi(source: pathlib.Path, config: Keep) -> Catalogue:
             motion = MOTION.get(data.get("exploratory_procedure", ""), "free")
             trial = trials[card.object_id, motion]
             key = ContactKey(object_id=card.object_id, site=0, motion=motion, trial=trial)
-        except (ValueError, KeyError, TypeError, SchemaError) as error:
+        except (*MALFORMED, SchemaError) as error:
             skipped.append(Skip(name=name, reason=f"data.json: {error}"))
             continue
         trials[card.object_id, motion] += 1

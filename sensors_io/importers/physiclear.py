@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from sensors_io.errors import MALFORMED
 from sensors_io.importers.catalogue import Catalogue, ImportReport, Listed, Taken, import_catalogue
 from sensors_io.importers.holdout import hold_out
 from sensors_io.importers.keep import ImportSourceError, Keep, Skip, check_share
@@ -128,7 +129,7 @@ def read_labels(path: pathlib.Path) -> list[LabelledObject]:
     try:
         entries = json.loads(path.read_text())["objects"]
         objects = [_labelled(entry) for entry in entries]
-    except (ValueError, KeyError, TypeError) as error:
+    except MALFORMED as error:
         raise ImportSourceError(f"{path}: {error!r}; correct the entry") from error
     for what, names in (
         ("object", [entry.card.object_id for entry in objects]),

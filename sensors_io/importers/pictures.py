@@ -62,7 +62,10 @@ def read_picture(path: pathlib.Path) -> np.ndarray:
     end = _END.get(data[:2])
     if end is not None and end not in data[-_TAIL:]:
         raise PictureError("is cut off")
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB) if data else None
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB) if data else None
+    except cv2.error as error:  # it states more pixels than OpenCV makes room for
+        raise PictureError("is larger than any picture") from error
     if image is None:
         raise PictureError("does not open as a picture")
     return image

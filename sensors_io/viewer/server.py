@@ -13,6 +13,7 @@ import ipaddress
 import json
 import math
 import secrets
+import sys
 import threading
 import urllib.parse
 from collections.abc import Mapping
@@ -110,6 +111,11 @@ class LiveView:
         host, port = self._wanted[0], (self._wanted if self._server is None else self._server.server_address)[1]
         return f"http://{host}:{port}/" + (f"?token={self._token}" if self._token else "")
 
+    @property
+    def cookie(self) -> str:
+        """By which a browser that was admitted shows the token again; empty where none is needed."""
+        return f"token={self._token}; HttpOnly; SameSite=Strict" if self._token else ""
+
     def admits(self, host: str, token: str) -> bool:
         """True if a request may be answered: it names this machine, so that no other page can ask, or has the token."""
         if self._token:
@@ -173,6 +179,11 @@ class LimitedServer(http.server.ThreadingHTTPServer):
         else:
             self.shutdown_request(request)
 
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say nothing of a connection that the other side broke off."""
+        if not isinstance(sys.exception(), ConnectionError | TimeoutError):
+            super().handle_error(request, client_address)
+
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         """Serve one connection to its end."""
         try:
@@ -189,22 +200,19 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Answer one request; the stream of numbers lasts until the browser or the view goes away."""
-        split = urllib.parse.urlsplit(self.path)
+        split = split_target(self.path)
         path = urllib.parse.unquote(split.path)
         token = urllib.parse.parse_qs(split.query).get("token", [self._cookie()])[0]
-        try:
-            if not self.live.admits(self.headers.get("Host", ""), token):
-                self.send_error(403, "open the address that the program printed")
-            elif path == "/":
-                self._whole("text/html; charset=utf-8", PAGE.encode(), f"token={token}; HttpOnly; SameSite=Strict")
-            elif path == "/numbers":
-                self._numbers()
-            elif path.startswith("/panel/"):
-                self._panel(path.removeprefix("/panel/"))
-            else:
-                self.send_error(404)
-        except (BrokenPipeError, ConnectionResetError, TimeoutError):
-            self.close_connection = True  # the browser was closed
+        if not self.live.admits(self.headers.get("Host", ""), token):
+            self.send_error(403, "open the address that the program printed")
+        elif path == "/":
+            self._whole("text/html; charset=utf-8", PAGE.encode(), self.live.cookie)
+        elif path == "/numbers":
+            self._numbers()
+        elif path.startswith("/panel/"):
+            self._panel(path.removeprefix("/panel/"))
+        else:
+            self.send_error(404)
 
     def log_message(self, format: str, *args: Any) -> None:
         """Say nothing: the terminal belongs to the session."""
@@ -250,7 +258,15 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
 def names_this_machine(host: str) -> bool:
     """True if the `Host` of a request names this machine, so that no page of another name can ask through a browser."""
-    return is_loopback(urllib.parse.urlsplit(f"//{host}").hostname or "")
+    return is_loopback(split_target(f"//{host}").hostname or "")
+
+
+def split_target(target: str) -> urllib.parse.SplitResult:
+    """The parts of an address; those of an empty one, which is nowhere, where it is none."""
+    try:
+        return urllib.parse.urlsplit(target)
+    except ValueError:
+        return urllib.parse.urlsplit("")
 
 
 def is_loopback(host: str) -> bool:

@@ -75,7 +75,10 @@ def test_a_zero_comes_back_from_its_file(tmp_path):
         np.testing.assert_array_equal(getattr(back.model, name), getattr(zero.model, name))
 
 
-@pytest.mark.parametrize("change", [{"down": [1, 2]}, {"bias_n": 3}, {"weight": 1}, None])
+@pytest.mark.parametrize(
+    "change",
+    [{"down": [1, 2]}, {"bias_n": 3}, {"weight": 1}, {"bias_n": [0, 0, float("nan")]}, {"weight_n": "x"}, None],
+)
 def test_a_file_without_a_zero_is_named(tmp_path, change):
     path = tmp_path / "g.json"
     fit_poses(found_in(*turned()[:3])).save(path)

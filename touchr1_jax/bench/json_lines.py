@@ -40,7 +40,7 @@ def read_lines(path: str | os.PathLike[str]) -> list[tuple[int, Any]]:
             continue
         try:
             tree = json.loads(line)
-        except json.JSONDecodeError as error:
+        except (ValueError, RecursionError) as error:
             raise LinesError(f"{path}, line {number}: {error}; every line must be one JSON object") from error
         if not isinstance(tree, dict):
             raise LinesError(f"{path}, line {number} is {tree!r}: must be a JSON object; write one per line")

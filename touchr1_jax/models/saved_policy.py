@@ -126,10 +126,11 @@ def read_policy(folder: Path) -> SavedPolicy:
       PolicyError: no such folder, a folder of something else, of a newer version, or damaged.
     """
     config = _read_config(folder)
-    for name, digest in config["files"].items():
-        if not (folder / name).is_file() or _sha256((folder / name).read_bytes()) != digest:
-            raise PolicyError(f"policy is {folder}: {name} is missing or damaged; copy the folder again")
     try:
+        for name in (SINGLE, TOKENIZER_FILE):
+            if not (folder / name).is_file() or _sha256((folder / name).read_bytes()) != config["files"][name]:
+                raise PolicyError(f"policy is {folder}: {name} is missing or damaged; copy the folder again")
+        notes = {**config["notes"]}
         model, language = _rebuilt(ModelConfig, config["model"]), _rebuilt(Language, config["language"])
         reads, questions = _rebuilt(PolicyInput, config["input"]), dict(config["questions"])
         vocabulary = json.loads((folder / TOKENIZER_FILE).read_text(encoding="utf-8"))["model"]["vocab"]
@@ -138,7 +139,9 @@ def read_policy(folder: Path) -> SavedPolicy:
         wanted = jax.eval_shape(
             functools.partial(policy.init, 0), touch_shapes(model, model.vision.image_px, config["sensors"])
         )
-    except (ValueError, TypeError, LookupError, AttributeError) as error:
+    except PolicyError:
+        raise
+    except (ValueError, TypeError, LookupError, AttributeError, RecursionError, AssertionError) as error:
         raise PolicyError(
             f"policy is {folder}: its config does not fit this version ({error}); save it anew"
         ) from error
@@ -149,8 +152,14 @@ def read_policy(folder: Path) -> SavedPolicy:
         raise PolicyError(
             f"policy is {folder}: parameters differ from this version's model in {', '.join(odd[:5])}; save it anew"
         )
+    infinite = sorted(name for name, x in params.items() if not np.isfinite(x).all())
+    if infinite:
+        raise PolicyError(
+            f"policy is {folder}: {', '.join(infinite[:5])} hold numbers that are not finite: its training diverged; "
+            "train it again"
+        )
     tree = traverse_util.unflatten_dict({name: jnp.asarray(x) for name, x in params.items()}, sep=".")
-    return SavedPolicy(policy=policy, params=tree, reads=reads, notes=config["notes"], questions=questions)
+    return SavedPolicy(policy=policy, params=tree, reads=reads, notes=notes, questions=questions)
 
 
 def default_card(saved: SavedPolicy, precision: Precision) -> str:
@@ -209,7 +218,7 @@ def _read_config(folder: Path) -> dict[str, Any]:
     try:
         found = json.loads((folder / CONFIG_FILE).read_text(encoding="utf-8"))
         kind, version = found.get("model_type"), found.get("version")
-    except (ValueError, AttributeError) as error:
+    except (ValueError, AttributeError, RecursionError) as error:
         raise PolicyError(f"{where}: {CONFIG_FILE} is damaged ({error}); copy the folder again") from error
     if kind != FORMAT:
         raise PolicyError(
@@ -250,10 +259,10 @@ def _read_params(folder: Path) -> dict[str, np.ndarray]:
     """Parameters in float32, by dotted names."""
     try:
         found = {name: read_tensor(entry) for name, entry in read_header(folder / SINGLE).items()}
+        params = {name: x.astype(np.float32) for name, x in found.items() if not name.endswith(SCALE)}
+        return {name: x * found[name + SCALE] if name + SCALE in found else x for name, x in params.items()}
     except (ValueError, LookupError) as error:
         raise PolicyError(f"policy is {folder}: {error}") from error
-    params = {name: x.astype(np.float32) for name, x in found.items() if not name.endswith(SCALE)}
-    return {name: x * found[name + SCALE] if name + SCALE in found else x for name, x in params.items()}
 
 
 def _rebuilt(kind: Any, value: Any) -> Any:

@@ -46,9 +46,12 @@ def check_template(directory: Path) -> Path:
         path = directory / name
         if not path.is_file():
             continue
-        text = path.read_text(encoding="utf-8")
-        template = text if path.suffix == ".jinja" else json.loads(text).get("chat_template")
-        if template is None:
+        try:
+            text = path.read_text(encoding="utf-8")
+            template = text if path.suffix == ".jinja" else json.loads(text).get("chat_template")
+        except (ValueError, AttributeError, RecursionError) as error:
+            raise ValueError(f"{path} is no JSON object: {error}; fetch it again") from error
+        if not isinstance(template, str):
             continue
         digest = hashlib.sha256(template.strip().encode()).hexdigest()
         if digest != TEMPLATE_SHA256:

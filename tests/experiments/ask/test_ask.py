@@ -4,9 +4,11 @@ import dataclasses
 import functools
 import json
 import re
+import socket
 import sys
 import types
 import urllib.error
+import urllib.parse
 import urllib.request
 
 import cv2
@@ -106,6 +108,12 @@ def test_plain_arrays_are_enough_and_misfits_are_named(asked):
         ({}, "frames are of no sensor"),
         ({"xense": np.zeros((5, 4, 4, 3), np.uint8)}, r"uint8\[5, 4, 4, 3\]: must be uint8 .* 1 ≤ F ≤ 4"),
         (TouchInput(frames=frames, force_n={"tac3d": np.zeros((2, 3))}), r"are \(2, 3\) and \(3,\): must be"),
+        (TouchInput(frames=frames, force_n={"tac3d": np.full((3, 3), np.nan)}), "must be finite numbers"),
+        (TouchInput(frames=frames, force_n={"gelsight": np.zeros((3, 3))}), "are of gelsight: must be of sensors with"),
+        (TouchInput(frames=frames, index={"tac3d": np.array([0, 1.5, 2])}), "whole numbers ≥ 0"),
+        (TouchInput(frames=frames, view=np.zeros((9, 9), np.uint8)), r"view is uint8\[9, 9\]: must be RGB"),
+        ({"tac3d": np.zeros((3, 0, 0, 3), np.uint8)}, r"uint8\[3, 0, 0, 3\]: must be uint8"),
+        ({"tac3d": 3}, r"must be uint8 \[F, H, W, 3\]"),
     ):
         with pytest.raises(QuestionError, match=message):
             asked.ask(wrong, "How hard is it?")
@@ -138,6 +146,8 @@ def test_inputs_are_read_as_training_data_are(asked, tmp_path):
     [
         ("generated:squishy", "'squishy' is no property; choose from soft, firm"),
         ("generated:soft,hard", "an object has one hardness"),
+        ("generated:²", "'²' is no property"),
+        ("generated:" + 5_000 * "9", "is no property"),
         ("nowhere.mp4", "no such file; must be a folder of records"),
         ("RECORDS:99", "must name a contact 0..15 or an object"),
         ("FILE", "does not open as a video"),
@@ -248,6 +258,32 @@ def test_the_demo_is_closed_to_other_pages_and_files(address, records):
     assert fetch(address, "video?name=a.avi", b"x", Origin="http://evil.example")[0] == 403
     assert fetch(address, f"generated?words={records}")[0] == 400
     assert fetch(address, "video?name=a.avi", b"", **{"Content-Length": str(2**40)})[0] == 413
+
+
+def test_requests_of_no_browser_are_refused_without_a_word_in_the_terminal(address, capfd):
+    """Lengths that are none, an upload that ends early, a name that is no file's, addresses that are none."""
+    split = urllib.parse.urlsplit(address)
+    host = f"Host: {split.netloc}\r\n".encode()
+    for request, status in (
+        (b"POST /video?name=a.avi HTTP/1.1\r\n" + host + b"Content-Length: \xb2\r\n\r\n", b"413"),
+        (b"POST /video?name=a.avi HTTP/1.1\r\n" + host + b"Content-Length: 9\r\n\r\nabc", b"400"),
+        (b"POST /video?name=a.%00 HTTP/1.1\r\n" + host + b"Content-Length: 3\r\n\r\nabc", b"400"),
+        (b"GET http://[ HTTP/1.1\r\n" + host + b"\r\n", b"404"),
+        (b"GET / HTTP/1.1\r\nHost: [\r\n\r\n", b"403"),
+    ):
+        with socket.create_connection((split.hostname, split.port), timeout=10) as connection:
+            connection.sendall(request)
+            connection.shutdown(socket.SHUT_WR)
+            answer = b"".join(iter(lambda: connection.recv(65_536), b""))
+        assert answer.partition(b" ")[2].startswith(status), request
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_a_run_whose_config_is_another_files_has_no_policy(tmp_path, capsys):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.json").write_text("7")
+    assert ask(tmp_path, "run", "generated") == 1
+    assert "PolicyError: policy is " in capsys.readouterr().err
 
 
 def test_a_comparison_needs_two_touches_in_code_too(asked):

@@ -126,6 +126,15 @@ def test_a_calibration_is_read_back_and_a_changed_one_is_refused(tmp_path: pathl
     refused(CalibrationError, f"its hash is {made.hash}, not {stated}", Calibration.load, tmp_path / "d.npz")
 
 
+def test_a_calibration_of_no_numbers_is_refused(tmp_path: pathlib.Path) -> None:
+    calibration(dotted()).save(tmp_path / "c.npz")
+    arrays = dict(np.load(tmp_path / "c.npz"))
+    np.savez(tmp_path / "d.npz", **arrays | {"weights": arrays["weights"] * np.float32(np.nan)})
+    refused(CalibrationError, "weights holds numbers that are not finite", Calibration.load, tmp_path / "d.npz")
+    np.savez(tmp_path / "d.npz", **arrays | {"plain": np.array("[" * 100_000)})
+    refused(CalibrationError, "is no calibration", Calibration.load, tmp_path / "d.npz")
+
+
 def test_frames_are_joined_in_order() -> None:
     extractor = Extractor(bare(), 0.1, calibration(bare()))
     one, two = extractor.read(bare()), extractor.read(touched(bare()))

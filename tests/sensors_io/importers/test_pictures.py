@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sensors_io.importers.keep import Keep
+from sensors_io.importers.keep import Keep, UnreadableError
 from sensors_io.importers.pictures import PictureError, natural, nominal_ns, numbered, read_picture, read_pictures
 from tests.sensors_io.checks import refused
 from tests.sensors_io.importers.films import cut, picture
@@ -84,3 +84,17 @@ def test_frame_numbers_are_times_at_a_rate():
 def test_frames_are_thinned_or_cut_into_pieces(keep, total, positions, pieces):
     assert keep.positions(total).tolist() == positions
     assert [piece.tolist() for piece in keep.pieces(total)] == pieces
+
+
+def test_pictures_that_would_fill_the_memory_are_refused(tmp_path):
+    """One that states 10¹⁰ pixels, and one of one row that 120 rows would make 14,400 times as large."""
+    chunk = lambda kind, data: struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", 100_000, 100_000, 8, 2, 0, 0, 0))
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", b"") + chunk(b"IEND", b""))
+    refused(PictureError, "is larger than any picture", read_picture, tmp_path / "a.png")
+    refused(
+        UnreadableError,
+        "has 1 × 20000 pixels, more than 100 columns",
+        Keep().shrink,
+        np.zeros((1, 20_000, 3), np.uint8),
+    )

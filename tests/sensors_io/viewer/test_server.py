@@ -4,6 +4,7 @@ import dataclasses
 import http.client
 import json
 import socket
+import struct
 import threading
 import urllib.error
 import urllib.parse
@@ -139,6 +140,29 @@ def test_a_view_for_the_network_wants_its_token():
         assert (status, cookie.partition(";")[0]) == (200, f"token={token}")
         view.publish({"a": plain(1, 2, 3)}, NUMBERS)
         assert requested(view, "/panel/a", Cookie=f"token={token}")[0] == 200
+
+
+def test_requests_of_no_browser_are_refused_without_a_word_in_the_terminal(capfd):
+    """Addresses that are none, a header smuggled into the answer, a connection that is reset."""
+    with LiveView(port=0) as view:
+        port = int(urllib.parse.urlsplit(view.address).port)
+        ended = b"\r\nConnection: close\r\n\r\n"
+        for target, host, status in (
+            (b"/", b"[", b"403"),
+            (b"http://[", b"localhost", b"404"),
+            (b"/?token=x%0d%0aSet-Cookie:%20a=b", b"localhost", b"200"),
+            (b"/?token=%E2%82%AC", b"localhost", b"200"),
+        ):
+            with socket.create_connection(("127.0.0.1", port), timeout=10) as connection:
+                connection.sendall(b"GET " + target + b" HTTP/1.1\r\nHost: " + host + ended)
+                answer = b"".join(iter(lambda: connection.recv(65_536), b""))
+            assert answer.partition(b" ")[2].startswith(status)
+            assert b"Set-Cookie" not in answer
+        with socket.create_connection(("127.0.0.1", port), timeout=10) as connection:
+            connection.sendall(b"GET /numbers HTTP/1.1\r\nHost: localhost")
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        assert requested(view)[0] == 200
+    assert capfd.readouterr().err == ""
 
 
 def test_connections_too_many_are_closed():

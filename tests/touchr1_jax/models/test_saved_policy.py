@@ -1,6 +1,7 @@
 """A policy survives its folder; folders of something else, of another version and damaged ones are named."""
 
 import dataclasses
+import hashlib
 import json
 
 import jax
@@ -87,12 +88,51 @@ DAMAGE = {
     "no such folder": lambda f: f.rename(f.with_name("away")),
     "holds no config.json": lambda f: (f / "config.json").unlink(),
     "config.json is damaged": lambda f: (f / "config.json").write_text("{"),
+    r"config.json is damaged \(maximum recursion": lambda f: (f / "config.json").write_text("[" * 100_000),
     "model_type in config.json is 'qwen2_5_vl': must be 'touchr1-policy'": lambda f: edit(f, model_type="qwen2_5_vl"),
     "version is 2: this code reads 1; update": lambda f: edit(f, version=2),
     "config.json was changed": lambda f: edit(f, sensors=["tac3d", "xense"]),
     "tokenizer.json is missing or damaged": lambda f: (f / "tokenizer.json").unlink(),
     "model.safetensors is missing or damaged": lambda f: flip(f / "model.safetensors"),
 }
+
+
+def sign(folder, change):
+    """Change the config as another version would, with a checksum that holds."""
+    config = json.loads((folder / "config.json").read_text())
+    config.pop("checksum")
+    change(config)
+    digest = hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
+    (folder / "config.json").write_text(json.dumps(config | {"checksum": digest}))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda c: c.pop("files"),
+        lambda c: c["files"].pop("model.safetensors"),
+        lambda c: c.update(files=[]),
+        lambda c: c.pop("notes"),
+        lambda c: c.update(notes=3),
+        lambda c: c.update(sensors=["xense", 4]),
+        lambda c: c["model"].update(frames="four"),
+        lambda c: c["model"].pop("decoder"),
+        lambda c: c.update(language=[]),
+        lambda c: c.update(questions=None),
+    ],
+)
+def test_a_config_of_another_version_is_named(folder, change):
+    sign(folder, change)
+    with pytest.raises(PolicyError, match=r"its config does not fit this version .*save it anew"):
+        read_policy(folder)
+
+
+def test_parameters_that_are_not_finite_are_refused(saved, tmp_path):
+    leaves, tree = jax.tree.flatten(saved.params)
+    diverged = jax.tree.unflatten(tree, [np.asarray(leaves[0]) * np.nan, *leaves[1:]])
+    save_policy(tmp_path / "p", dataclasses.replace(saved, params=diverged))
+    with pytest.raises(PolicyError, match="hold numbers that are not finite: its training diverged"):
+        read_policy(tmp_path / "p")
 
 
 def flip(path):

@@ -60,7 +60,7 @@ def read_key(path: Path, items: Sequence[Item]) -> dict[str, str]:
     must = "must be the .key.json next to the sheet; correct the path"
     try:
         key = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise SheetError(f"{path} cannot be read ({error}): {must}") from error
     if not isinstance(key, dict) or not all(isinstance(name, str) for name in key.values()):
         raise SheetError(f"{path} holds no key: {must}")

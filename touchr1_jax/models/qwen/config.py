@@ -141,7 +141,7 @@ def read_config(directory: str | Path) -> QwenConfig:
         raise FileNotFoundError(f"{path} is no file: must be the config.json of a checkpoint; correct the directory")
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is no JSON: {error}; fetch it again") from error
     return parse_config(found)
 

@@ -50,7 +50,7 @@ def read_budget(directory: Path, config: QwenVisionConfig) -> PixelBudget:
         raise FileNotFoundError(f"{path} is no file: must be the picture settings of a checkpoint; fetch it")
     try:
         written = dict(json.loads(path.read_text(encoding="utf-8")))
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, RecursionError) as error:
         raise ValueError(f"{path} is no JSON object: {error}; fetch it again") from error
     found = {field: value for field, value in written.items() if value is not None}  # newer files list what is unset
     expected = {

@@ -6,6 +6,7 @@ pages of a shard of several gigabytes count as long as it is open; here one tens
 """
 
 import json
+import math
 import os
 import struct
 from collections.abc import Callable, Mapping
@@ -68,8 +69,10 @@ def read_header(path: Path) -> dict[str, TensorEntry]:
             raise ValueError(f"{path} is no safetensors file or was cut off: its header does not fit; fetch it again")
         try:
             header = json.loads(file.read(length))
-        except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        except (ValueError, RecursionError) as error:
             raise ValueError(f"{path}: the header is no JSON ({error}); fetch it again") from error
+    if not isinstance(header, dict):
+        raise ValueError(f"{path}: the header is no JSON object; fetch it again")
     tensors = {name: x for name, x in header.items() if name != METADATA}
     return {name: _entry(path, name, x, 8 + length, size) for name, x in tensors.items()}
 
@@ -122,13 +125,17 @@ def write_file(
 
 def _entry(path: Path, name: str, found: Mapping[str, Any], body: int, size: int) -> TensorEntry:
     """One entry of a header whose tensors start at byte `body`, held against its own shape and the file."""
-    fields = {"dtype", "shape", "data_offsets"} - found.keys()
+    fields = {"dtype", "shape", "data_offsets"} - {*found}
     if fields:
         raise ValueError(f"{path}: {name} lacks {', '.join(sorted(fields))}; fetch the file again")
+    sizes = [found["shape"], found["data_offsets"]]
+    whole = all(isinstance(x, list) and all(type(n) is int and 0 <= n < 2**60 for n in x) for x in sizes)
+    if not whole or len(found["data_offsets"]) != 2:
+        raise ValueError(f"{path}: shape and data_offsets of {name} are {sizes}: must be sizes; fetch the file again")
     start, end = (body + offset for offset in found["data_offsets"])
     entry = TensorEntry(path, found["dtype"], tuple(found["shape"]), start, end)
     if entry.dtype in STORED:
-        needed = STORED[entry.dtype].itemsize * int(np.prod(entry.shape, dtype=np.int64))
+        needed = STORED[entry.dtype].itemsize * math.prod(entry.shape)
         if entry.size != needed:
             raise ValueError(
                 f"{entry.path}: {name} has {entry.size} bytes, its type and shape need {needed}; fetch the file again"

@@ -147,7 +147,7 @@ def _raw_tensors(directory: Path) -> dict[str, safetensors.TensorEntry]:
         return safetensors.read_header(single)
     try:
         place = dict(json.loads(index.read_text(encoding="utf-8"))["weight_map"])
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{index} is no index: must be JSON with a weight_map ({error!r}); fetch it again") from error
     entries: dict[str, safetensors.TensorEntry] = {}
     for shard in sorted(set(place.values())):

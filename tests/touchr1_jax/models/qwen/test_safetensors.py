@@ -65,6 +65,23 @@ def test_header_must_be_json(tmp_path):
         read_header(tmp_path / "x")
 
 
+@pytest.mark.parametrize("header", [b"[]", b"7", b"[" * 100_000, b'{"a": 3}', b'{"a": "dtype"}'])
+def test_header_must_be_an_object_of_objects(tmp_path, header):
+    raw_file(tmp_path / "x", header, b"")
+    with pytest.raises(ValueError, match="header is no JSON|a lacks data_offsets"):
+        read_header(tmp_path / "x")
+
+
+@pytest.mark.parametrize(
+    "change", [{"shape": ["3"]}, {"shape": 3}, {"shape": [1.5, 2]}, {"data_offsets": [-12, 0]}, {"data_offsets": [0]}]
+)
+def test_shapes_and_offsets_must_be_sizes(tmp_path, change):
+    """Negative offsets would read the header as weights."""
+    raw_file(tmp_path / "x", {"a": {"dtype": "F32", "shape": [3], "data_offsets": [0, 12]} | change}, bytes(12))
+    with pytest.raises(ValueError, match="shape and data_offsets of a are .*: must be sizes"):
+        read_header(tmp_path / "x")
+
+
 def test_bytes_must_fit_the_shape(tmp_path):
     raw_file(tmp_path / "x", {"a": {"dtype": "F32", "shape": [4], "data_offsets": [0, 12]}}, bytes(12))
     with pytest.raises(ValueError, match="a has 12 bytes, its type and shape need 16"):
