@@ -341,7 +341,7 @@ def clip_arrays(touch: TouchInput, saved: SavedPolicy) -> dict[str, np.ndarray]:
             continue
         frames = np.asarray(touch.frames[sensor])
         n = len(frames) if frames.ndim == 4 else 0
-        if not all(map(_is_picture, frames)) or not 1 <= n <= model.frames:
+        if not 1 <= n <= model.frames or not all(map(_is_picture, frames)):
             raise QuestionError(
                 f"frames[{sensor}] are {frames.dtype}{list(frames.shape)}: must be uint8 [F, H, W, 3] with 1 ≤ F ≤ "
                 f"{model.frames}; choose frames that cover the contact, as sensors_io.selection.choose_frames does"
