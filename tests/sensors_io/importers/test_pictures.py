@@ -1,5 +1,8 @@
 """Pictures are read whole or left out by name, and what they leave behind is marked as a gap."""
 
+import struct
+import zlib
+
 import numpy as np
 import pytest
 

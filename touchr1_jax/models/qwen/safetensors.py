@@ -123,15 +123,17 @@ def write_file(
     os.replace(partial, path)
 
 
-def _entry(path: Path, name: str, found: Mapping[str, Any], body: int, size: int) -> TensorEntry:
+def _entry(path: Path, name: str, found: Any, body: int, size: int) -> TensorEntry:
     """One entry of a header whose tensors start at byte `body`, held against its own shape and the file."""
-    fields = {"dtype", "shape", "data_offsets"} - {*found}
+    fields = {"dtype", "shape", "data_offsets"} - {*(found if isinstance(found, dict) else ())}
     if fields:
         raise ValueError(f"{path}: {name} lacks {', '.join(sorted(fields))}; fetch the file again")
     sizes = [found["shape"], found["data_offsets"]]
     whole = all(isinstance(x, list) and all(type(n) is int and 0 <= n < 2**60 for n in x) for x in sizes)
     if not whole or len(found["data_offsets"]) != 2:
         raise ValueError(f"{path}: shape and data_offsets of {name} are {sizes}: must be sizes; fetch the file again")
+    if not isinstance(found["dtype"], str):
+        raise ValueError(f"{path}: dtype of {name} is {found['dtype']}: must be a type's name; fetch the file again")
     start, end = (body + offset for offset in found["data_offsets"])
     entry = TensorEntry(path, found["dtype"], tuple(found["shape"]), start, end)
     if entry.dtype in STORED:
