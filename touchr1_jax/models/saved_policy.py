@@ -136,8 +136,8 @@ def read_policy(folder: Path) -> SavedPolicy:
         vocabulary = json.loads((folder / TOKENIZER_FILE).read_text(encoding="utf-8"))["model"]["vocab"]
         words = sorted(vocabulary, key=vocabulary.__getitem__)[len(word_library(()).get_vocab()) :]
         policy = assemble_policy(model, language, word_tokenizer(words), questions)
-        sensors = [sensor.name for sensor in language.sensors]
-        if config["sensors"] != sensors:
+        sensors = tuple(sensor.name for sensor in language.sensors)
+        if tuple(config["sensors"]) != sensors:
             raise ValueError(f"sensors are {config['sensors']}, its language has {sensors}")
         wanted = jax.eval_shape(functools.partial(policy.init, 0), touch_shapes(model, model.vision.image_px, sensors))
     except PolicyError:

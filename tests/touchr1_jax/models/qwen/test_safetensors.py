@@ -68,7 +68,7 @@ def test_header_must_be_json(tmp_path):
 @pytest.mark.parametrize("header", [b"[]", b"7", b"[" * 100_000, b'{"a": 3}', b'{"a": "dtype"}'])
 def test_header_must_be_an_object_of_objects(tmp_path, header):
     raw_file(tmp_path / "x", header, b"")
-    with pytest.raises(ValueError, match="header is no JSON|a lacks data_offsets"):
+    with pytest.raises(ValueError, match=r"header is no JSON|a lacks data_offsets"):
         read_header(tmp_path / "x")
 
 
@@ -86,7 +86,7 @@ def test_header_must_be_an_object_of_objects(tmp_path, header):
 def test_shapes_and_offsets_must_be_sizes(tmp_path, change):
     """Negative offsets would read the header as weights."""
     raw_file(tmp_path / "x", {"a": {"dtype": "F32", "shape": [3], "data_offsets": [0, 12]} | change}, bytes(12))
-    with pytest.raises(ValueError, match="of a (are|is) .*: must be (sizes|a type)"):
+    with pytest.raises(ValueError, match=r"of a (are|is) .*: must be (sizes|a type)"):
         read_header(tmp_path / "x")
 
 
