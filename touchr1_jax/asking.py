@@ -339,27 +339,8 @@ def clip_arrays(touch: TouchInput, saved: SavedPolicy) -> dict[str, np.ndarray]:
     for s, sensor in enumerate(sensors):
         if sensor not in touch.frames:
             continue
-        frames = np.asarray(touch.frames[sensor])
-        n = len(frames) if frames.ndim == 4 else 0
-        if not 1 <= n <= model.frames or not all(map(_is_picture, frames)):
-            raise QuestionError(
-                f"frames[{sensor}] are {frames.dtype}{list(frames.shape)}: must be uint8 [F, H, W, 3] with 1 ≤ F ≤ "
-                f"{model.frames}; choose frames that cover the contact, as sensors_io.selection.choose_frames does"
-            )
-        force, index = (
-            np.asarray(given.get(sensor, default))
-            for given, default in ((touch.force_n, np.zeros((n, 3))), (touch.index, np.arange(n)))
-        )
-        if np.shape(force) != (n, 3) or np.shape(index) != (n,):
-            raise QuestionError(
-                f"force_n[{sensor}] and index[{sensor}] are {np.shape(force)} and {np.shape(index)}: must be "
-                f"({n}, 3) and ({n},) for {n} frames; align them"
-            )
-        if not np.isfinite(force).all() or index.dtype.kind not in "iu" or index.min() < 0:
-            raise QuestionError(
-                f"force_n[{sensor}] and index[{sensor}] must be finite numbers and whole numbers ≥ 0; leave a force "
-                "out that was not measured"
-            )
+        frames, force, index = _checked(touch, sensor, model.frames)
+        n = len(frames)
         of["frames"][s, :n] = [_resized(frame, model.image_px) for frame in frames]
         of["force_n"][s, :n], of["frame_index"][s, :n], of["frame_mask"][s, :n] = force, index, True
     if touch.view is not None:
@@ -368,6 +349,32 @@ def clip_arrays(touch: TouchInput, saved: SavedPolicy) -> dict[str, np.ndarray]:
             raise QuestionError(f"view is {view.dtype}{list(view.shape)}: must be RGB uint8 [H, W, 3]; convert it")
         of["view"] = _resized(view, model.vision.image_px)
     return of
+
+
+def _checked(touch: TouchInput, sensor: str, most: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Frames of one sensor, their force and their index, of as many frames each and no more than `most`."""
+    frames = np.asarray(touch.frames[sensor])
+    n = len(frames) if frames.ndim == 4 else 0
+    if not 1 <= n <= most or not all(map(_is_picture, frames)):
+        raise QuestionError(
+            f"frames[{sensor}] are {frames.dtype}{list(frames.shape)}: must be uint8 [F, H, W, 3] with 1 ≤ F ≤ "
+            f"{most}; choose frames that cover the contact, as sensors_io.selection.choose_frames does"
+        )
+    force, index = (
+        np.asarray(given.get(sensor, default))
+        for given, default in ((touch.force_n, np.zeros((n, 3))), (touch.index, np.arange(n)))
+    )
+    if np.shape(force) != (n, 3) or np.shape(index) != (n,):
+        raise QuestionError(
+            f"force_n[{sensor}] and index[{sensor}] are {np.shape(force)} and {np.shape(index)}: must be "
+            f"({n}, 3) and ({n},) for {n} frames; align them"
+        )
+    if not np.isfinite(force).all() or index.dtype.kind not in "iu" or index.min() < 0:
+        raise QuestionError(
+            f"force_n[{sensor}] and index[{sensor}] must be finite numbers and whole numbers ≥ 0; leave a force "
+            "out that was not measured"
+        )
+    return frames, force, index
 
 
 def _is_picture(image: np.ndarray) -> bool:
