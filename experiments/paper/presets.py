@@ -37,12 +37,13 @@ from touchr1_jax.training.optimizer import OptimizerConfig
 from touchr1_jax.training.train_encoder import EncoderTrainingConfig
 
 BENCH = StudyConfig(
+    encoders=EncoderTrainingConfig(),
     decoder=dataclasses.replace(DECODER, steps=1800, save_every=300),
     blind=StudySFT(steps=1350, micro_contacts=16),
     grpo_steps=200,
 )
-"""The default: a longer phase of the decoder than in `ablation_ordinal`, whose score on validation objects still rises
-at its end; policies that several studies share may cost more than a main job."""
+"""The default: longer phases of the encoders and the decoder than in `ablation_ordinal`, whose score on validation
+objects still rises at its end; policies that several studies share may cost more than a main job."""
 
 SMALL_QUOTA = Quota(identify=48, scale=18, compose=16, compare=12, order=6, one_sensor=16, conflict=8)
 """Questions of the bench at `smoke`; every other scale asks all 4,800."""

@@ -76,6 +76,8 @@ class StudyConfig(TrainingConfig):
     """All settings of a study whose towers start from fresh parameters."""
 
     model: ModelConfig = MODEL
+    encoders: EncoderTrainingConfig = EncoderTrainingConfig(steps=500)
+    """Half of the default: comparisons of rewards start from one policy, and need not start from the best."""
     share: bool = True
     """Take policies from the cache where an experiment with the same data, settings and code trained them."""
 
