@@ -1,5 +1,6 @@
 """The reward of a trajectory: its answer, less the price of the time that it took and of the harm that it did."""
 
+import itertools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -42,13 +43,14 @@ def priced_answer(parsed: Parsed, target: Target, spent: Spent, prices: Prices) 
     }
 
 
-def check_touch_reward(reward: TouchReward, prices: Prices, target: Target, outcome: Outcome) -> None:
-    """Compute the reward of every constant answer and of none, before any action and after each.
+def check_touch_reward(reward: TouchReward, prices: Prices, target: Target, outcome: Outcome, budget: int = 1) -> None:
+    """Compute the reward of every constant answer and of none: before any action, after each, after several slow ones.
 
     Args:
       reward, prices: those of training.
       target: truth of n prompts.
       outcome: of every action in the n prompts (`environment.check_environment`).
+      budget: most actions of a trajectory.
 
     Raises:
       RewardError: a price below 0 or not finite, a reward that is no dictionary of float scalars or is not finite.
@@ -56,9 +58,11 @@ def check_touch_reward(reward: TouchReward, prices: Prices, target: Target, outc
     for name, price in prices._asdict().items():
         if not 0 <= float(price) < np.inf:
             raise RewardError(f"prices.{name} is {float(price)}: must be finite and ≥ 0; correct it")
-    for action in range(-1, outcome.seconds.shape[1]):
-        for level in range(-1, int(np.max(target.levels))):
-            _earned(reward, prices, target, np.full(target.label.shape, level, np.int32), _after(outcome, action))
+    slowest = _after(outcome, np.argmax(outcome.seconds, -1))
+    spent = [_after(outcome, action) for action in range(-1, outcome.seconds.shape[1])]
+    spent += [Spent(*(times * total for total in slowest)) for times in range(2, budget + 1)]
+    for totals, level in itertools.product(spent, range(-1, int(np.max(target.levels)))):
+        _earned(reward, prices, target, np.full(target.label.shape, level, np.int32), totals)
 
 
 def check_touching_pays(reward: TouchReward, prices: Prices, target: Target, outcome: Outcome) -> None:

@@ -223,7 +223,7 @@ def check_exploration(
         which, attribute = labelled_questions(np.asarray(environment.label))
         batch = touch_batch_of(policy, environment, which, attribute)
     outcome = check_environment(environment, batch.case, budget=budget)
-    check_touch_reward(reward, prices, batch.target, outcome)
+    check_touch_reward(reward, prices, batch.target, outcome, budget)
     if isinstance(environment, TouchBank):
         check_touching_pays(reward, prices, batch.target, outcome)
 

@@ -57,6 +57,13 @@ def test_a_reward_that_is_no_number_is_named(outcome, names):
         check_touch_reward(FAULTS[names], FREE, EVERY.target, outcome)
 
 
+def test_a_reward_that_fails_after_the_second_action_is_named(outcome):
+    reward = lambda parsed, target, spent, prices: {"bad": 1 / (2.0 - spent.actions)}
+    check_touch_reward(reward, FREE, EVERY.target, outcome, budget=1)
+    with pytest.raises(RewardError, match="'bad' of the reward is inf"):
+        check_touch_reward(reward, FREE, EVERY.target, outcome, budget=2)
+
+
 @pytest.mark.parametrize("price", [-1.0, jnp.nan, jnp.inf])
 @pytest.mark.parametrize("name", Prices._fields)
 def test_prices_that_are_no_price_are_named(outcome, name, price):
