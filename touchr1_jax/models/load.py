@@ -16,7 +16,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
-import flax.traverse_util
 import jax
 import jax.numpy as jnp
 import tyro
@@ -56,8 +55,8 @@ def load_checkpoint(
     """Read a checkpoint; small files first, so that a wrong one is refused before the weights are read.
 
     Args:
-      directory: `config.json`, `tokenizer.json`, `preprocessor_config.json`, a chat template, and the weights as
-        `load_params` reads them.
+      directory: `config.json`, `tokenizer.json`, `preprocessor_config.json` or `processor_config.json`, a chat
+        template, and the weights as `load_params` reads them.
       dtype: type of all parameters.
       progress: told of the weights as `load_params` tells.
 
@@ -101,31 +100,8 @@ def check_ids(tokenizer: Tokenizer, config: QwenConfig) -> None:
             )
 
 
-def check_finite(params: Params, progress: ReportBytes = lambda done_bytes, all_bytes: None) -> None:
-    """Refuse weights that are no numbers; a loader that reads every release need not look, the command does.
-
-    Args:
-      params: the weights.
-      progress: called after each.
-
-    Raises:
-      WeightsError: NaN or infinity.
-    """
-    whole = jax.jit(lambda x: jnp.isfinite(x).all())
-    every = flax.traverse_util.flatten_dict(params, sep="/")
-    done, size, broken = 0, sum(x.nbytes for x in every.values()), []
-    for name, x in every.items():
-        if not whole(x):
-            broken.append(name)
-        done += x.nbytes
-        progress(done, size)
-    if broken:
-        more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
-        raise WeightsError(f"{broken[0]}{more} holds NaN or infinity: must be finite; fetch the weights again")
-
-
 @contextlib.contextmanager
-def _bar(title: str) -> Iterator[ReportBytes]:
+def _bar() -> Iterator[ReportBytes]:
     """Bytes, rate and time left on stderr; where that is no terminal, its last state alone."""
     columns = (
         TextColumn("{task.description}"),
@@ -136,7 +112,7 @@ def _bar(title: str) -> Iterator[ReportBytes]:
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task(title, total=None)
+        task = bar.add_task("reading", total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
@@ -151,10 +127,8 @@ class Load:
         """Read, report, and return the exit status."""
         console, began = Console(soft_wrap=True, highlight=False), time.perf_counter()
         try:
-            with _bar("reading") as progress:
+            with _bar() as progress:
                 found = load_checkpoint(self.directory, jnp.dtype(self.dtype), progress)
-            with _bar("checking") as progress:
-                check_finite(found.params, progress)
         except (OSError, ValueError) as error:
             Console(stderr=True, soft_wrap=True).print(
                 f"{type(error).__name__}: {error}", markup=False, highlight=False

@@ -52,7 +52,7 @@ def test_weights_that_are_no_numbers_are_named(directory, capsys):
     content[entry.start : entry.start + 4] = np.float32("nan").tobytes()
     (directory / "model.safetensors").write_bytes(content)
     assert Load(directory=directory).run() == 1
-    assert "vision/patch_embed holds NaN or infinity: must be finite" in capsys.readouterr().err
+    assert "visual.patch_embed.proj.weight holds NaN or infinity as bfloat16: must be finite" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("file", ["tokenizer.json", "preprocessor_config.json"])
@@ -85,6 +85,9 @@ def test_ids_must_be_those_of_the_tokenizer(directory):
         ({"patch_size": 14}, "patch_size is 14: must be 4"),
         ({"image_mean": [0.5, 0.5, 0.5]}, "image_mean is .*: must be"),
         ({"max_pixels": None}, "names neither min_pixels and max_pixels nor"),
+        ({"min_pixels": "a"}, r"min_pixels, max_pixels are 'a', \d+: must be whole"),
+        ({"min_pixels": 2**40}, "must be whole, 1 ≤ min ≤ max"),
+        ({"max_pixels": None, "size": 3}, "names neither min_pixels and max_pixels nor"),
     ],
 )
 def test_picture_settings_must_be_those_computed(directory, change, message):
@@ -98,3 +101,13 @@ def test_newer_picture_settings_are_read(directory):
     settings = {"size": {"shortest_edge": 100, "longest_edge": 200}, "min_pixels": None, "patch_size": None}
     (directory / "preprocessor_config.json").write_text(json.dumps(settings))
     assert load_checkpoint(directory).budget == PixelBudget(least=100, most=200)
+
+
+def test_the_settings_of_newer_folders_are_read(directory):
+    (directory / "preprocessor_config.json").unlink()
+    settings = PICTURES | {"min_pixels": 128}
+    (directory / "processor_config.json").write_text(json.dumps({"image_processor": settings, "video_processor": {}}))
+    assert load_checkpoint(directory).budget == PixelBudget(least=128, most=4096)
+    (directory / "processor_config.json").write_text(json.dumps({"video_processor": {}}))
+    with pytest.raises(ValueError, match="is no JSON object with settings of pictures"):
+        load_checkpoint(directory)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -21,8 +22,8 @@ class QwenVisionConfig:
     Layers attend inside windows of `window_px`² pixels, those in `full_layers` inside the whole frame.
 
     Raises:
-      ValueError: heads that do not divide the width or cannot turn in two axes, or a window that is no whole number of
-        merged patches.
+      ValueError: heads that do not divide the width or cannot turn in two axes, a window that is no whole number of
+        merged patches, or full layers outside the tower.
     """
 
     out_size: int
@@ -47,6 +48,8 @@ class QwenVisionConfig:
                 f"window_px {self.window_px} must be a multiple of patch_px · merge = {self.cell_px}: a window holds "
                 "whole tokens"
             )
+        if not all(0 <= layer < self.depth for layer in self.full_layers):
+            raise ValueError(f"full layers are {list(self.full_layers)}: must lie in 0..{self.depth - 1}")
 
     @property
     def cell_px(self) -> int:
@@ -146,17 +149,21 @@ def read_config(directory: str | Path) -> QwenConfig:
     return parse_config(found)
 
 
-def parse_config(found: Mapping[str, Any]) -> QwenConfig:
+def parse_config(found: Any) -> QwenConfig:
     """Configuration from the contents of a `config.json`, flat as published or nested as newer libraries write it.
 
+    A vision tower whose file states a part of its shape has the published defaults elsewhere (32B, 72B).
+
     Raises:
-      ValueError: a field that is missing or that asks for what these modules do not compute.
+      ValueError: a field that is missing, of another type, or that asks for what these modules do not compute.
     """
-    _require("model_type", found, "qwen2_5_vl")
-    text = _Fields(found["text_config"], "text_config.") if "text_config" in found else _Fields(found, "")
-    root, vision = _Fields(found, ""), _Fields(_Fields(found, "")["vision_config"], "vision_config.")
+    root = _Fields(found, "")
+    root.require("model_type", "qwen2_5_vl")
+    text = root.part("text_config") if "text_config" in root.found else root
+    vision = root.part("vision_config")
+    tied = any(part.found.get("tie_word_embeddings", False) for part in (root, text))  # absence means no
     return QwenConfig(
-        decoder=_decoder(text, tied=_is_tied(found)),
+        decoder=_decoder(text, tied=tied),
         vision=_vision(vision),
         vision_start_id=root.count("vision_start_token_id"),
         vision_end_id=root.count("vision_end_token_id"),
@@ -166,9 +173,11 @@ def parse_config(found: Mapping[str, Any]) -> QwenConfig:
 
 
 class _Fields:
-    """A part of a `config.json` whose missing fields are named in full."""
+    """A part of a `config.json` whose missing and mistyped fields are named in full."""
 
-    def __init__(self, found: Mapping[str, Any], prefix: str) -> None:
+    def __init__(self, found: Any, prefix: str) -> None:
+        if not isinstance(found, dict):
+            raise ValueError(f"{prefix.rstrip('.') or CONFIG_FILE} is {found!r:.60}: must be an object; fetch it again")
         self.found, self.prefix = found, prefix
 
     def __getitem__(self, name: str) -> Any:
@@ -176,16 +185,43 @@ class _Fields:
             raise ValueError(f"config.json lacks {self.prefix}{name}, without which the model has no shape; add it")
         return self.found[name]
 
-    def count(self, name: str) -> int:
+    def part(self, name: str) -> "_Fields":
+        """A field that must be an object."""
+        return _Fields(self[name], f"{self.prefix}{name}.")
+
+    def require(self, name: str, value: Any, *, default: bool = False) -> None:
+        """A field that must have a value, which with `default` it has where it is missing."""
+        if name not in self.found and not default:
+            raise ValueError(f"config.json lacks {self.prefix}{name}: must be {value!r}; add it")
+        if self.found.get(name, value) != value:
+            raise ValueError(
+                f"{self.prefix}{name} is {self.found[name]!r}: must be {value!r}; another architecture cannot be read"
+            )
+
+    def count(self, name: str, default: int | None = None) -> int:
         """A field that must be a whole number above 0."""
-        value = self[name]
+        value = self[name] if default is None else self.found.get(name, default)
         if type(value) is not int or value < 1:
             raise ValueError(f"{self.prefix}{name} is {value!r}: must be a whole number above 0; correct config.json")
         return value
 
+    def positive(self, name: str) -> float:
+        """A field that must be a finite number above 0."""
+        value = self[name]
+        if type(value) not in (int, float) or not 0 < value < math.inf:
+            raise ValueError(f"{self.prefix}{name} is {value!r}: must be a number above 0; correct config.json")
+        return float(value)
+
+    def counts(self, name: str, default: tuple[int, ...] | None = None) -> tuple[int, ...]:
+        """A field that must be a list of whole numbers."""
+        value = self[name] if default is None else self.found.get(name, list(default))
+        if not isinstance(value, list) or not all(type(x) is int for x in value):
+            raise ValueError(f"{self.prefix}{name} is {value!r}: must be a list of whole numbers; correct config.json")
+        return tuple(value)
+
 
 def _decoder(text: _Fields, *, tied: bool) -> DecoderConfig:
-    _require("hidden_act", text.found, "silu", text.prefix)
+    text.require("hidden_act", "silu")
     if text.found.get("use_sliding_window"):
         raise ValueError(f"{text.prefix}use_sliding_window is true: only full attention is computed; set it to false")
     theta, sections = _rope(text)
@@ -201,54 +237,41 @@ def _decoder(text: _Fields, *, tied: bool) -> DecoderConfig:
         head_dim=hidden // heads,
         intermediate_size=text.count("intermediate_size"),
         mrope_section=sections,
-        rope_theta=float(theta),
-        norm_epsilon=text["rms_norm_eps"],
+        rope_theta=theta,
+        norm_epsilon=text.positive("rms_norm_eps"),
         tie_embedding=tied,
     )
 
 
 def _rope(text: _Fields) -> tuple[float, tuple[int, int, int]]:
     """Base and sections of the rotary positions: `rope_theta` beside `rope_scaling`, or both in `rope_parameters`."""
-    name = "rope_parameters" if "rope_parameters" in text.found else "rope_scaling"
-    rope = _Fields(text[name], f"{text.prefix}{name}.")
-    kinds = {rope.found[k] for k in ("type", "rope_type") if k in rope.found}
-    if not kinds <= {"mrope", "default"}:
-        raise ValueError(
-            f"{rope.prefix}type is {sorted(kinds)}: must be 'mrope' or 'default'; nothing else is computed"
-        )
-    theta = rope.found["rope_theta"] if "rope_theta" in rope.found else text["rope_theta"]
-    sections = tuple(rope["mrope_section"])
+    rope = text.part("rope_parameters" if "rope_parameters" in text.found else "rope_scaling")
+    kinds = [rope.found[k] for k in ("type", "rope_type") if k in rope.found]
+    if not all(kind in ("mrope", "default") for kind in kinds):
+        raise ValueError(f"{rope.prefix}type is {kinds}: must be 'mrope' or 'default'; nothing else is computed")
+    theta = (rope if "rope_theta" in rope.found else text).positive("rope_theta")
+    sections = rope.counts("mrope_section")
     if len(sections) != 3:
         raise ValueError(f"{rope.prefix}mrope_section is {list(sections)}: must be three, for time, row and column")
     return theta, sections
 
 
 def _vision(vision: _Fields) -> QwenVisionConfig:
-    _require("hidden_act", vision.found, "silu", vision.prefix)
-    channels = "in_channels" if "in_channels" in vision.found else "in_chans"
-    _require(channels, vision.found, COLOURS, vision.prefix)
-    return QwenVisionConfig(
-        out_size=vision.count("out_hidden_size"),
-        depth=vision.count("depth"),
+    vision.require("hidden_act", "silu", default=True)
+    for channels in ("in_channels", "in_chans"):
+        vision.require(channels, COLOURS, default=True)
+    if "tokens_per_second" in vision.found:  # of videos, whose positions are not computed here
+        vision.positive("tokens_per_second")
+    usual = QwenVisionConfig(out_size=vision.count("out_hidden_size"))
+    return dataclasses.replace(
+        usual,
+        depth=vision.count("depth", usual.depth),
         hidden_size=vision.count("hidden_size"),
-        num_heads=vision.count("num_heads"),
-        intermediate_size=vision.count("intermediate_size"),
-        patch_px=vision.count("patch_size"),
-        patch_frames=vision.count("temporal_patch_size"),
-        merge=vision.count("spatial_merge_size"),
-        window_px=vision.count("window_size"),
-        full_layers=tuple(vision["fullatt_block_indexes"]),
+        num_heads=vision.count("num_heads", usual.num_heads),
+        intermediate_size=vision.count("intermediate_size", usual.intermediate_size),
+        patch_px=vision.count("patch_size", usual.patch_px),
+        patch_frames=vision.count("temporal_patch_size", usual.patch_frames),
+        merge=vision.count("spatial_merge_size", usual.merge),
+        window_px=vision.count("window_size", usual.window_px),
+        full_layers=vision.counts("fullatt_block_indexes", usual.full_layers),
     )
-
-
-def _is_tied(found: Mapping[str, Any]) -> bool:
-    """True if the head is the embedding table; a flag in either place counts, absence means no, as in transformers."""
-    parts = [found, found.get("text_config", {})]
-    return any(part.get("tie_word_embeddings", False) for part in parts)
-
-
-def _require(name: str, found: Mapping[str, Any], value: Any, prefix: str = "") -> None:
-    if name not in found:
-        raise ValueError(f"config.json lacks {prefix}{name}: must be {value!r}; add it")
-    if found[name] != value:
-        raise ValueError(f"{prefix}{name} is {found[name]!r}: must be {value!r}; another architecture cannot be read")

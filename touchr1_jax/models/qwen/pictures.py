@@ -17,7 +17,9 @@ CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
 CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 """Mean and spread of pixels in [0, 1] on CLIP's training data (Radford et al. 2021), per channel."""
 
-PREPROCESSOR_FILE = "preprocessor_config.json"
+PREPROCESSOR_FILE, PROCESSOR_FILE = "preprocessor_config.json", "processor_config.json"
+"""Settings of pictures as published, and where transformers ≥ 5 writes them, as its part `image_processor`."""
+
 MAX_ASPECT = 200
 """Longest side over shortest, beyond which the released processor refuses a picture."""
 
@@ -35,7 +37,7 @@ PICTURE_BUDGET = PixelBudget(least=28 * 28 * 4, most=28 * 28 * 1280)
 
 
 def read_budget(directory: Path, config: QwenVisionConfig) -> PixelBudget:
-    """Budget of pictures from a checkpoint's `preprocessor_config.json`; the rest of it must be what is computed here.
+    """Budget of pictures from a checkpoint's settings of pictures; the rest of them must be what is computed here.
 
     Args:
       directory: the checkpoint's.
@@ -46,12 +48,15 @@ def read_budget(directory: Path, config: QwenVisionConfig) -> PixelBudget:
       ValueError: no JSON, sizes of patches that are not the config's, another normalisation, or no budget.
     """
     path = directory / PREPROCESSOR_FILE
+    if not path.is_file() and (directory / PROCESSOR_FILE).is_file():
+        path = directory / PROCESSOR_FILE
     if not path.is_file():
         raise FileNotFoundError(f"{path} is no file: must be the picture settings of a checkpoint; fetch it")
     try:
         written = dict(json.loads(path.read_text(encoding="utf-8")))
-    except (ValueError, TypeError, RecursionError) as error:
-        raise ValueError(f"{path} is no JSON object: {error}; fetch it again") from error
+        written = dict(written["image_processor"]) if path.name == PROCESSOR_FILE else written
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise ValueError(f"{path} is no JSON object with settings of pictures: {error}; fetch it again") from error
     found = {field: value for field, value in written.items() if value is not None}  # newer files list what is unset
     expected = {
         "patch_size": config.patch_px,
@@ -63,11 +68,14 @@ def read_budget(directory: Path, config: QwenVisionConfig) -> PixelBudget:
     for field, value in expected.items():
         if found.get(field, value) != value:
             raise ValueError(f"{path}: {field} is {found[field]}: must be {value}; take all files from one checkpoint")
-    size = found.get("size", {})
-    least = found.get("min_pixels", size.get("shortest_edge"))
-    most = found.get("max_pixels", size.get("longest_edge"))
+    size = found.get("size")
+    edges = size if isinstance(size, dict) else {}
+    least = found.get("min_pixels", edges.get("shortest_edge"))
+    most = found.get("max_pixels", edges.get("longest_edge"))
     if least is None or most is None:
         raise ValueError(f"{path} names neither min_pixels and max_pixels nor a size with both edges; add them")
+    if not (type(least) is int and type(most) is int and 1 <= least <= most):
+        raise ValueError(f"{path}: min_pixels, max_pixels are {least!r}, {most!r}: must be whole, 1 ≤ min ≤ max")
     return PixelBudget(least=least, most=most)
 
 

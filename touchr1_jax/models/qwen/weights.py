@@ -23,6 +23,7 @@ from touchr1_jax.types import Params
 
 SINGLE = "model.safetensors"
 INDEX = "model.safetensors.index.json"
+HEAD, EMBEDDING = "lm_head.weight", "text.embed_tokens.weight"
 SHOWN = 12
 """How many misfits an error lists before it counts the rest."""
 
@@ -37,7 +38,7 @@ def load_params(
     """Parameters of `QwenVL` from the safetensors files of a directory.
 
     One tensor at a time is read, cast and laid out, the largest first, while little else is held: the host never holds
-    more than the parameters placed on it and two copies of a small one.
+    more than the parameters placed on it and two copies of a small one.  A tied checkpoint may also store the head.
 
     Args:
       directory: `model.safetensors`, or `model.safetensors.index.json` with its shards.
@@ -48,11 +49,19 @@ def load_params(
 
     Raises:
       FileNotFoundError: no weights, or a shard that is missing.
-      ValueError: a file that is no safetensors file, or keys that are missing, extra, double, of the wrong shape or of
-        a type that no weight has; all of them are listed.
+      ValueError: a file that is no safetensors file; keys that are missing, extra, double, of the wrong shape or of
+        a type that no weight has, all of them listed; a tied head that differs from the embedding; NaN or infinity.
     """
     entries = find_tensors(Path(directory))
     wanted = sources(config)
+    head, embedding = entries.get(HEAD), entries.get(EMBEDDING)
+    if config.decoder.tie_embedding and head and embedding and head.shape == embedding.shape:
+        del entries[HEAD]
+        if not np.array_equal(safetensors.read_tensor(head), safetensors.read_tensor(embedding)):
+            raise ValueError(
+                f"{head.path}: {HEAD} differs from the embedding, which config.json ties to it; set "
+                "tie_word_embeddings to false, or fetch the files again"
+            )
     misfits = compare(entries, {s.key: s.shape for s in wanted.values()})
     if misfits:
         more = f"\n  … and {len(misfits) - SHOWN} more" if len(misfits) > SHOWN else ""
@@ -66,7 +75,12 @@ def load_params(
     done, size, loaded = 0, sum(entry.size for entry in entries.values()), {}
     progress(done, size)
     for path, s in by_size:
-        loaded[path] = place(entries[s.key], turned=s.turned)
+        loaded[path], finite = place(entries[s.key], turned=s.turned)
+        if not finite:
+            raise ValueError(
+                f"{entries[s.key].path}: {published(s.key)} holds NaN or infinity as {jnp.dtype(dtype)}: must be "
+                "finite; fetch the weights again, or load them in float32"
+            )
         done += entries[s.key].size
         progress(done, size)
     return flax.traverse_util.unflatten_dict(loaded)
@@ -168,12 +182,15 @@ def _file_of(name: str, entries: Mapping[str, safetensors.TensorEntry]) -> str |
     return entries[name].path.name if name in entries else None
 
 
-def _place(entry: safetensors.TensorEntry, *, turned: bool, dtype: jnp.dtype, device: jax.Device | None) -> Array:
-    """One parameter on its device; waits for it, so that no two tensors are on their way at once."""
+def _place(
+    entry: safetensors.TensorEntry, *, turned: bool, dtype: jnp.dtype, device: jax.Device | None
+) -> tuple[Array, Array]:
+    """One parameter on its device, and whether it is finite; waits, so that no two tensors are on their way at once."""
     raw = jax.device_put(safetensors.read_tensor(entry), device)
     return jax.block_until_ready(_lay_out(raw, turned, dtype))
 
 
 @functools.partial(jax.jit, static_argnames=("turned", "dtype"))
-def _lay_out(raw: Array, turned: bool, dtype: jnp.dtype) -> Array:
-    return names.read(raw, turned).astype(dtype)
+def _lay_out(raw: Array, turned: bool, dtype: jnp.dtype) -> tuple[Array, Array]:
+    found = names.read(raw, turned).astype(dtype)
+    return found, jnp.isfinite(found).all()

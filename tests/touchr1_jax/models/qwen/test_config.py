@@ -99,6 +99,19 @@ def test_missing_and_broken_files(tmp_path):
         ({"vision_config": SEVEN_B["vision_config"] | {"in_chans": 1}}, "vision_config.in_chans is 1: must be 3"),
         ({"vision_config": SEVEN_B["vision_config"] | {"window_size": 100}}, "window_px 100 must be a multiple"),
         ({"vision_config": SEVEN_B["vision_config"] | {"num_heads": 7}}, "must be a multiple of 4"),
+        ({"vision_config": SEVEN_B["vision_config"] | {"fullatt_block_indexes": [7, 32]}}, r"must lie in 0\.\.31"),
+        ({"vision_config": SEVEN_B["vision_config"] | {"fullatt_block_indexes": None}}, "must be a list of whole"),
+        ({"vision_config": SEVEN_B["vision_config"] | {"fullatt_block_indexes": [[7]]}}, "must be a list of whole"),
+        ({"vision_config": SEVEN_B["vision_config"] | {"tokens_per_second": "2"}}, "'2': must be a number above 0"),
+        ({"vision_config": []}, r"vision_config is \[\]: must be an object"),
+        ({"text_config": None}, "text_config is None: must be an object"),
+        ({"rope_scaling": None}, "rope_scaling is None: must be an object"),
+        ({"rope_scaling": {"type": [], "mrope_section": [16, 24, 24]}}, r"rope_scaling.type is \[\[\]\]"),
+        ({"rope_scaling": {"type": "mrope", "mrope_section": 3}}, "mrope_section is 3: must be a list"),
+        ({"rope_theta": "1e6"}, "rope_theta is '1e6': must be a number above 0"),
+        ({"rms_norm_eps": "1e-6"}, "rms_norm_eps is '1e-6': must be a number above 0"),
+        ({"rms_norm_eps": float("nan")}, "rms_norm_eps is nan: must be a number above 0"),
+        ({"hidden_size": [3584]}, r"hidden_size is \[3584\]: must be a whole number"),
     ],
 )
 def test_what_is_not_computed_is_refused(change, message):
@@ -110,6 +123,19 @@ def test_what_is_not_computed_is_refused(change, message):
 def test_missing_field_is_named(field):
     with pytest.raises(ValueError, match=rf"config\.json lacks {field}"):
         parse_config({k: v for k, v in SEVEN_B.items() if k != field})
+
+
+def test_a_vision_tower_has_the_published_defaults_where_the_file_says_nothing():
+    """As the released 32B and 72B are written, whose towers differ from the others in two sizes."""
+    vision = {"hidden_size": 1280, "in_chans": 3, "intermediate_size": 3456, "out_hidden_size": 3584}
+    found = parse_config(SEVEN_B | {"vision_config": vision | {"spatial_patch_size": 14, "tokens_per_second": 2}})
+    assert found.vision == QwenVisionConfig(out_size=3584, intermediate_size=3456)
+
+
+@pytest.mark.parametrize("found", [None, [], "qwen2_5_vl", 3])
+def test_a_config_that_is_no_object_is_named(found):
+    with pytest.raises(ValueError, match=r"config\.json is .*: must be an object"):
+        parse_config(found)
 
 
 def test_missing_nested_field_is_named_in_full():

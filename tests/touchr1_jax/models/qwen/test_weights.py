@@ -140,6 +140,19 @@ def test_tied_head_beside_an_untied_config_is_missing(tmp_path, weights):
     assert "missing: lm_head.weight (96, 64)" in misfit(tmp_path, weights)
 
 
+def test_a_tied_checkpoint_may_store_its_head(tmp_path, weights):
+    """As some libraries write it, and only where it is the embedding."""
+    tied, table = tiny.config_of(CASES["text"]), weights["model.embed_tokens.weight"]
+    write_file(tmp_path / "model.safetensors", weights | {"lm_head.weight": table})
+    assert "head" not in load_params(tmp_path, tied)["decoder"]
+    write_file(tmp_path / "model.safetensors", weights | {"lm_head.weight": -table})
+    with pytest.raises(ValueError, match=r"lm_head\.weight differs from the embedding"):
+        load_params(tmp_path, tied)
+    write_file(tmp_path / "model.safetensors", weights | {"lm_head.weight": table[:-1]})
+    with pytest.raises(ValueError, match=r"extra: lm_head\.weight"):
+        load_params(tmp_path, tied)
+
+
 def test_types_that_no_weight_has_are_named(tmp_path, weights):
     write_file(tmp_path / "model.safetensors", weights)
     content = (tmp_path / "model.safetensors").read_bytes()
