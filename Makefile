@@ -8,7 +8,7 @@ READY  := $(VENV)/.ready
 
 PYTHONS ?= python3.11 python3.12
 
-.PHONY: help setup experiment demo test test-slow test-matrix lint format clean
+.PHONY: help setup experiment demo test test-slow test-matrix lint format docs dist clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -46,6 +46,16 @@ lint: setup  ## check style, imports and types
 format: setup  ## rewrite the sources in the house format
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+docs: setup  ## build the site of the documents in build/site
+	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[docs]'
+	$(BIN)/mkdocs build --quiet --strict
+
+dist: setup  ## build wheel and sdist in dist/ and check them
+	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[release]'
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist .
+	$(BIN)/twine check --strict dist/*
 
 clean:  ## remove the environments and caches, keep data/ and runs/
 	rm -rf $(VENV) .venv-* build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -22,7 +22,9 @@ from touchr1_jax.rewards.__main__ import Command as Rewards
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("touchr1_jax", "sensors_io", "experiments")
 DOCUMENTS = [ROOT / "README.md", *(ROOT / ".github").glob("*.md"), *(ROOT / p / "README.md" for p in PACKAGES)]
-DOCUMENTS.append(ROOT / "experiments" / "TUTORIAL.md")
+DOCUMENTS += [ROOT / "experiments" / name for name in ("TUTORIAL.md", "REPRODUCTION.md", "LOG.md")]
+DOCUMENTS += sorted(path for kind in ("*.md", "*.ipynb") for path in (ROOT / "docs").rglob(kind))
+DOCUMENTS += sorted((ROOT / "touchr1_jax" / "policies").glob("*/README.md"))
 EXPERIMENTS = find("experiments")
 
 MODULE = re.compile(r"^(?:    )?(?:.*`)?python -m ((?:experiments|sensors_io|touchr1_jax)[\w.]*) ?([^`\n]*)", re.M)
@@ -64,7 +66,7 @@ def read(module: str, arguments: str) -> None:
             sensors_command(words)
     elif module == "experiments" and words[0] in EXPERIMENTS:
         parse(importlib.import_module(EXPERIMENTS[words[0]].module).EXPERIMENT, words[1:], "")
-    elif module == "experiments" and words[0] not in {"NAME", *WRITTEN_BY_TUTORIAL}:
+    elif module == "experiments" and words[0] not in {"NAME", "EXPERIMENT", *WRITTEN_BY_TUTORIAL}:
         assert words[0] in COMMANDS, f"there is no experiment {words[0]!r}"
         kind: object = AskingCommand if words[0] in ASKING else Command
         tyro.cli(kind, args=words, config=(tyro.conf.OmitArgPrefixes,))

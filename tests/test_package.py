@@ -14,7 +14,7 @@ PACKAGES = ("touchr1_jax", "sensors_io", "experiments")
 DOCUMENTS = [
     ROOT / "README.md",
     *(ROOT / ".github").glob("*.md"),
-    *(p for x in PACKAGES for p in (ROOT / x).rglob("*.md")),
+    *(p for x in (*PACKAGES, "docs") for p in (ROOT / x).rglob("*.md")),
 ]
 SHAPE = re.compile(r'\w+\[[\w. |]+, "([^"]*)"\]')
 

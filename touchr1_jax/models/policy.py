@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.models.layers import RMSNorm
 from touchr1_jax.models.lm import Decoder, DecoderConfig, LayerCache, PrefixCache, Segments
-from touchr1_jax.models.tactile_vit import TactileViT, TactileViTConfig
+from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.types import Params, TouchBatch
 
 
@@ -87,7 +87,7 @@ class Policy(nn.Module):
 
     def setup(self) -> None:
         c = self.config
-        self.tactile = TactileViT(c.tactile)
+        self.tactile = c.tactile.tower()
         self.tactile_norm = RMSNorm()
         self.tactile_in = nn.Dense(2 * c.decoder.hidden_size)
         self.tactile_out = nn.Dense(c.decoder.hidden_size)

@@ -60,6 +60,10 @@ class TactileViTConfig:
         """Side of a patch."""
         return self.stem_px * self.patch_cells
 
+    def tower(self) -> nn.Module:
+        """The encoder that a policy builds; another one overrides this and has the arguments of `TactileViT`."""
+        return TactileViT(self)
+
     def __post_init__(self) -> None:
         check_sizes(self, "width", "num_heads", "mlp_ratio", "stem_px", "stem_width", "patch_cells")
         check_sizes(self, "frames_per_step", "tokens_per_step")
