@@ -338,5 +338,6 @@ class AlarmMonitor:
 
 
 def _mean(steps: Collection[Metrics]) -> Metrics:
-    """Mean over steps that log alike."""
-    return {name: sum(m[name] for m in steps) / len(steps) for name in next(iter(steps))}
+    """Mean over steps of what all of them log: a score on held-out data stands on some lines only."""
+    first, *others = steps
+    return {name: sum(m[name] for m in steps) / len(steps) for name in first if all(name in m for m in others)}

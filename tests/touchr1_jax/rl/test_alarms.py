@@ -106,6 +106,17 @@ def test_a_single_batch_without_touch_is_reported_at_once():
     assert monitor.update(HEALTHY) == []
 
 
+def test_a_score_that_stands_on_some_lines_stops_no_check():
+    """As on the steps with a checkpoint: the line that has it may be the first of a window or not."""
+    monitor = AlarmMonitor()
+    broken = HEALTHY | {"entropy": 0.0, "accuracy": 0.2}
+    for t in range(2 * WINDOW):
+        scored = {"held_out": 0.5} if t % 5 == 4 else {}
+        alarms = monitor.update((HEALTHY if t < WINDOW else broken) | scored)
+    assert {a.code for a in alarms} == set(fired(broken))
+    assert alarms
+
+
 def test_updates_that_are_left_out_are_counted_over_a_window():
     """Their metrics are not judged, and one in twenty is no alarm."""
     monitor = AlarmMonitor()
