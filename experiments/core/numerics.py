@@ -5,6 +5,7 @@ Cores, threads and thread pools change no bit.  The number of devices does; the 
 
 import os
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -27,6 +28,18 @@ UNSUPPORTED = {
 }
 """Settings of JAX that no experiment runs with, and the reason."""
 
+DEFAULTS: Mapping[str, Any] = {
+    "jax_high_dynamic_range_gumbel": False,
+    "jax_random_seed_offset": 0,
+    "jax_softmax_custom_jvp": False,
+    "jax_exec_time_optimization_effort": 0.0,
+    "jax_optimization_level": "UNKNOWN",
+}
+"""Settings of JAX that change results or may, each with its default; they count where they differ from it."""
+
+ENVIRONMENT = ("LIBTPU_INIT_ARGS", "NVIDIA_TF32_OVERRIDE")
+"""Environment variables that accelerators read; they count where they are set."""
+
 HARMLESS = ("--xla_force_host_platform_device_count", "--xla_dump", "--xla_hlo_profile")
 """Flags of XLA that change no result."""
 
@@ -44,8 +57,14 @@ def require_supported() -> None:
 
 def settings() -> dict[str, Any]:
     """The settings of JAX and the flags of XLA that change results."""
-    flags = sorted(flag for flag in os.environ.get(FLAGS, "").split() if not flag.startswith(HARMLESS))
-    return {name: jax.config.values[name] for name in SETTINGS} | {FLAGS: flags}
+    given = os.environ.get(FLAGS, "").strip()
+    if given and not given.startswith("-") and Path(given).is_file():  # XLA then reads its flags from there
+        given = Path(given).read_text(encoding="utf-8")
+    flags = sorted(flag for flag in given.split() if not flag.startswith(HARMLESS))
+    found = {name: jax.config.values[name] for name in SETTINGS} | {FLAGS: flags}
+    now = {name: jax.config.values.get(name, default) for name, default in DEFAULTS.items()}
+    found |= {name: value for name, value in now.items() if value != DEFAULTS[name]}
+    return found | {name: os.environ[name] for name in ENVIRONMENT if os.environ.get(name)}
 
 
 def require_same(before: Mapping[str, Any] | None, where: object) -> None:

@@ -170,12 +170,23 @@ def read_description(directory: Path) -> dict[str, Any]:
     """
     path = directory / "config.json"
     found = read_json(path)
-    if not isinstance(found, dict) or not found.keys() >= FIELDS:
+    if not _describes_run(found):
         raise DamagedFileError(
             f"{path} is not that of a run (must hold {', '.join(sorted(FIELDS))}): put a copy back, or move its run "
             "away and start a new one"
         )
     return found
+
+
+def _describes_run(found: Any) -> bool:
+    """True of what `describe` makes, by its names and the types of what is shown of it."""
+    if not isinstance(found, dict) or not found.keys() >= FIELDS:
+        return False
+    git, versions = found["git"], found.get("versions", {})
+    if not isinstance(git, dict) or git.keys() != {f.name for f in dataclasses.fields(Revision)}:
+        return False
+    words = (*(found[name] for name in ("experiment", "scale", "command")), git["commit"])
+    return isinstance(versions, dict) and all(isinstance(word, str) for word in words)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

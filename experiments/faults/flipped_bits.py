@@ -108,7 +108,11 @@ def go_on_flipped(
             flip_bit(home / one.path, one.bit)
         for path in (home / PRINTED, *home.rglob("results.json")):
             path.unlink(missing_ok=True)
+        damaged = {home / one.path: (home / one.path).read_bytes() for one in group}
         code, output = Session(training, home, programs).end()
+        for one in group:  # a checkpoint of a stage that is done is not looked into, and would be refused if it were
+            if (home / one.path).exists() and (home / one.path).read_bytes() == damaged[home / one.path]:
+                flip_bit(home / one.path, one.bit)
         outcome = end_of_run(home / training.name, code, output, wanted)
         yield Damage(file=name, damage="a random bit flipped", outcome=outcome, message=telling_line(output))
         shutil.rmtree(home)
@@ -186,6 +190,7 @@ def _program(path: Path) -> str:
 
 
 READERS: tuple[tuple[str, Callable[[Path], str]], ...] = (
+    (r"\.orbax-checkpoint-tmp/", lambda path: ""),  # a save that was cut off: no session looks into it
     (r"/(_CHECKPOINT_METADATA|commit_success\.txt)$", lambda path: ""),  # times, and a mark that is only looked for
     (r"/checkpoints/.*/\d+/", _checkpoint),
     (r"/metrics\.jsonl$", _log),

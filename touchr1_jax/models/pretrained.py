@@ -79,16 +79,22 @@ def load_encoder(path: Path) -> PretrainedEncoder:
         raise EncoderError(f"encoder is {path}: cannot be read ({error!r}); {fix}") from error
     if about is None:
         raise EncoderError(f"encoder is {path}: it has no entry {_ABOUT!r}; {fix}")
-    known = {f.name for f in dataclasses.fields(TactileViTConfig)}
-    if set(about["config"]) != known:
-        odd = sorted(set(about["config"]) ^ known)
-        raise EncoderError(f"encoder is {path}: its config differs in {odd}, it is of another version; train it again")
-    return PretrainedEncoder(
-        config=TactileViTConfig(**about["config"]),
-        sensors=tuple(about["sensors"]),
-        params=jax.tree.map(jnp.asarray, traverse_util.unflatten_dict(entries, sep="/")),
-        notes=about["notes"],
-    )
+    try:
+        odd = sorted(set(about["config"]) ^ {f.name for f in dataclasses.fields(TactileViTConfig)})
+        if odd:
+            raise EncoderError(
+                f"encoder is {path}: its config differs in {odd}, it is of another version; train it again"
+            )
+        return PretrainedEncoder(
+            config=TactileViTConfig(**about["config"]),
+            sensors=tuple(about["sensors"]),
+            params=jax.tree.map(jnp.asarray, traverse_util.unflatten_dict(entries, sep="/")),
+            notes=dict(about["notes"]),
+        )
+    except EncoderError:
+        raise
+    except (*_BROKEN, ArithmeticError) as error:
+        raise EncoderError(f"encoder is {path}: its entry {_ABOUT!r} is of another form ({error!r}); {fix}") from error
 
 
 def _array(content: bytes) -> np.ndarray:

@@ -142,7 +142,15 @@ def read_policy(folder: Path) -> SavedPolicy:
         wanted = jax.eval_shape(functools.partial(policy.init, 0), touch_shapes(model, model.vision.image_px, sensors))
     except PolicyError:
         raise
-    except (ValueError, TypeError, LookupError, AttributeError, RecursionError, AssertionError) as error:
+    except (
+        ValueError,
+        TypeError,
+        LookupError,
+        AttributeError,
+        ArithmeticError,
+        RecursionError,
+        AssertionError,
+    ) as error:
         raise PolicyError(
             f"policy is {folder}: its config does not fit this version ({error}); save it anew"
         ) from error

@@ -29,11 +29,23 @@ def test_flags_that_change_results_are_settings(monkeypatch, flags, kept):
     numerics.require_same(None, "a run of an earlier version")
 
 
+def test_flags_in_a_file_and_variables_of_accelerators_are_settings(monkeypatch, tmp_path):
+    monkeypatch.setenv(FLAGS, str(tmp_path / "flags"))
+    (tmp_path / "flags").write_text("--xla_cpu_enable_fast_math=true\n--xla_dump_to=/tmp/x\n")
+    assert numerics.settings()[FLAGS] == ["--xla_cpu_enable_fast_math=true"]
+    before = numerics.settings()
+    monkeypatch.setenv("NVIDIA_TF32_OVERRIDE", "1")
+    assert numerics.changed(before, numerics.settings()) == ("NVIDIA_TF32_OVERRIDE was None and is '1'",)
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [
         ("jax_default_matmul_precision", "float32"),
         ("jax_default_prng_impl", "rbg"),
+        ("jax_random_seed_offset", 7),
+        ("jax_high_dynamic_range_gumbel", None),
+        ("jax_softmax_custom_jvp", None),
         ("jax_threefry_partitionable", None),
     ],
 )

@@ -1,6 +1,7 @@
 """Run directories, the revision of the code, and past runs as `list` shows them."""
 
 import dataclasses
+import json
 import subprocess
 import sys
 
@@ -38,8 +39,12 @@ def test_revision_is_clean_dirty_or_unknown(tmp_path, monkeypatch):
     assert runs.revision(tmp_path).commit == "unknown"
 
 
+FOREIGN = '{"experiment": "coin", "scale": "a", "config": {}, "command": "b", "git": %s}'
+
+
 def test_runs_of_one_second_get_their_own_directories(tmp_path):
-    made = {runs.create(tmp_path / "coin", {field: {} for field in runs.FIELDS}) for _ in range(3)}
+    description = json.loads(FOREIGN % '{"commit": "a", "dirty": false}')
+    made = {runs.create(tmp_path / "coin", description) for _ in range(3)}
     assert len(made) == 3
     assert runs.newest(tmp_path / "coin", {}, finished=False) == max(made)
     write_json(max(made) / "results.json", FINISHED)
@@ -115,7 +120,7 @@ def test_a_damaged_run_hides_no_other(tmp_path, capsys):
         assert "20260103-000000/config.json is not that of a run" in out
 
 
-@pytest.mark.parametrize("content", ["{}", "[]", "7", '{"config": {}}'])
+@pytest.mark.parametrize("content", ["{}", "[]", "7", '{"config": {}}', FOREIGN % "3", FOREIGN % "{}"])
 def test_a_foreign_configuration_is_named(tmp_path, content):
     (make_run(tmp_path, "20260101-000000") / "config.json").write_text(content)
     with pytest.raises(DamagedFileError, match=r"config.json is not that of a run"):

@@ -54,6 +54,14 @@ def test_kills_and_damage_are_counted():
     assert [(row[SAME], row[OLDER]) for row in by_kind] == [(2, 0), (0, 1)]
 
 
+def test_a_save_that_was_cut_off_is_of_no_kind_that_is_read(tmp_path, context):
+    half = tmp_path / "run" / "checkpoints" / "sft" / "0" / "6.orbax-checkpoint-tmp" / "state" / "x"
+    half.parent.mkdir(parents=True)
+    half.write_bytes(b"half")
+    (flip,) = flipped_bits.flip_bits(tmp_path / "run", tmp_path, context, count=1)
+    assert flip.reading == flipped_bits.SAME
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_damaged_checkpoint_ends_the_same_or_names_what_is_wrong(tmp_path, context):

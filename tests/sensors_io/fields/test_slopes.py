@@ -66,6 +66,8 @@ def test_normal_to_slope_is_a_tangent_and_is_limited() -> None:
     slope, other = to_slopes(n, np.zeros_like(n))
     np.testing.assert_allclose(slope, [[0, 0.75, -0.75, 0.93 / np.sqrt(1 - 0.93**2)]], rtol=1e-4)
     assert not other.any()
+    alone = to_slopes(np.full((1, 1), 0.97, np.float32), np.zeros((1, 1), np.float32))[0]  # below 1, the only one
+    np.testing.assert_allclose(alone, 0.93 / np.sqrt(1 - 0.93**2), rtol=1e-4)
 
 
 def test_legendre_products_are_orthogonal() -> None:

@@ -247,3 +247,10 @@ def test_contacts_of_one_object_are_resampled_together():
 def test_a_reference_without_error_is_refused():
     with pytest.raises(ValueError, match=r"reference sums to 0\.0: must be > 0"):
         skill(np.ones(2), np.zeros(2), np.arange(2))
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "excludes"), [(0.0, 1.0, False), (-1.0, 0.0, False), (1e-9, 1.0, True), (-1.0, -1e-9, True)]
+)
+def test_an_interval_that_touches_zero_does_not_exclude_it(low, high, excludes):
+    assert statistics.Interval(mean=(low + high) / 2, low=low, high=high).excludes_zero == excludes

@@ -1,6 +1,8 @@
 """A pretrained encoder on disk."""
 
 import dataclasses
+import io
+import json
 
 import jax
 import numpy as np
@@ -47,6 +49,22 @@ def test_what_is_no_encoder_is_refused(encoder, tmp_path):
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     with pytest.raises(ValueError, match="it has no entry 'about'"):
         load_encoder(tmp_path / "other.npz")
+
+
+@pytest.mark.parametrize(
+    "about",
+    [[], {}, {"config": None}, {"config": 3}, {"sensors": 3}, {"notes": None}, {"num_heads": None}, {"num_heads": 0}],
+)
+def test_an_encoder_of_another_form_is_named(encoder, tmp_path, about):
+    with np.load(io.BytesIO(encoder.to_bytes())) as file:
+        entries = dict(file)
+    whole = json.loads(entries["about"].tobytes())
+    if isinstance(about, dict) and about.keys() <= {"num_heads"}:
+        about = {"config": whole["config"] | about} if about else about
+    changed = whole | about if about and isinstance(about, dict) else about
+    np.savez(tmp_path / "a.npz", **entries | {"about": np.frombuffer(json.dumps(changed).encode(), np.uint8)})
+    with pytest.raises(EncoderError, match=r"its entry 'about' is of another form .*give a file"):
+        load_encoder(tmp_path / "a.npz")
 
 
 def test_a_flipped_bit_is_named_or_harmless(encoder, tmp_path):

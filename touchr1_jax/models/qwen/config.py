@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-import math
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -208,7 +208,7 @@ class _Fields:
     def positive(self, name: str) -> float:
         """A field that must be a finite number above 0."""
         value = self[name]
-        if type(value) not in (int, float) or not 0 < value < math.inf:
+        if type(value) not in (int, float) or not 0 < value <= sys.float_info.max:
             raise ValueError(f"{self.prefix}{name} is {value!r}: must be a number above 0; correct config.json")
         return float(value)
 

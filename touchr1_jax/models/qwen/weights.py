@@ -161,6 +161,9 @@ def _raw_tensors(directory: Path) -> dict[str, safetensors.TensorEntry]:
         return safetensors.read_header(single)
     try:
         place = dict(json.loads(index.read_text(encoding="utf-8"))["weight_map"])
+        odd = [shard for shard in place.values() if not isinstance(shard, str) or Path(shard).name != shard]
+        if odd:
+            raise ValueError(f"{odd[0]!r} must be the name of a file beside it")
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(f"{index} is no index: must be JSON with a weight_map ({error!r}); fetch it again") from error
     entries: dict[str, safetensors.TensorEntry] = {}

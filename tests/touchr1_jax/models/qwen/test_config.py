@@ -110,6 +110,7 @@ def test_missing_and_broken_files(tmp_path):
         ({"rope_scaling": {"type": "mrope", "mrope_section": 3}}, "mrope_section is 3: must be a list"),
         ({"rope_theta": "1e6"}, "rope_theta is '1e6': must be a number above 0"),
         ({"rms_norm_eps": "1e-6"}, "rms_norm_eps is '1e-6': must be a number above 0"),
+        ({"rms_norm_eps": 10**400}, "rms_norm_eps is 1000"),
         ({"rms_norm_eps": float("nan")}, "rms_norm_eps is nan: must be a number above 0"),
         ({"hidden_size": [3584]}, r"hidden_size is \[3584\]: must be a whole number"),
     ],

@@ -205,7 +205,18 @@ def test_shards_without_an_index_ask_for_it(tmp_path, weights):
         load_params(tmp_path, CONFIG)
 
 
-@pytest.mark.parametrize("content", ["{", "{}", "[]", '{"weight_map": 1}'])
+@pytest.mark.parametrize(
+    "content",
+    [
+        "{",
+        "{}",
+        "[]",
+        '{"weight_map": 1}',
+        '{"weight_map": {"a": 1}}',
+        '{"weight_map": {"a": []}}',
+        '{"weight_map": {"a": "../b"}}',
+    ],
+)
 def test_index_must_be_one(tmp_path, content):
     (tmp_path / "model.safetensors.index.json").write_text(content)
     with pytest.raises(ValueError, match="is no index: must be JSON with a weight_map"):
