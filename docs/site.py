@@ -32,7 +32,7 @@ def on_files(files: Files, config: Any) -> Files:
     given |= gallery(files, config)
     for uri, text in given.items():
         files.append(File.generated(config, uri, content=text))
-    known, new = set(given), [ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), ROOT / "experiments" / "LOG.md"]
+    known, new = set(given), [ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / ".github").glob("*.md")]
     while new:
         path = new.pop()
         uri = path.relative_to(ROOT).as_posix()
