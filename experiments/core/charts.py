@@ -206,6 +206,9 @@ def bars(
     return draw([panel])
 
 
+BEATEN = "×: another choice is no slower and no less accurate"
+"""Title of a chart whose dominated choices are crossed."""
+
 Point = tuple[str, float, float, float]
 """Name, ms a frame, median error, 95th percentile of the error."""
 
@@ -215,15 +218,33 @@ def speed_against_error(
 ) -> bytes:
     """Draw error over time a frame, logarithmic; each point's bar reaches from the median to the 95th percentile.
 
-    Points of a kind are joined in the order given; a goal of time and error is drawn as a corner.
+    Points of a kind are joined in the order given; a goal of time and error is drawn as a corner.  Crosses mark points
+    that another one dominates.
     """
     series = []
     for kind, points in groups.items():
         names, ms, median, high = zip(*points, strict=True)
         series.append(Series(kind, x=ms, y=median, high=high, labels=names))
+    every = [point[1:3] for points in groups.values() for point in points]
+    beaten = crosses(every, dominated(every))
+    title = BEATEN if beaten else ""
+    series += beaten
     rules = [] if goal is None else [Rule(x=goal[0], y=goal[1])]
     axes: dict[str, Any] = {"x_scale": "log", "y_scale": "log", "x_label": "time a frame, ms", "y_label": error}
-    return draw([Panel(series, **axes, rules=rules)], size=(7.4, 4.6), legend=legend)
+    return draw([Panel(series, **axes, rules=rules, title=title)], size=(7.4, 4.6), legend=legend)
+
+
+def dominated(costs: Sequence[Sequence[float]]) -> list[bool]:
+    """For each choice, whether another one costs no more in any respect and less in one; NaN dominates nothing."""
+    every = np.asarray(costs, float).reshape(len(costs), -1)
+    return [bool(((every <= one).all(-1) & (every < one).any(-1)).any()) for one in every]
+
+
+def crosses(points: Sequence[Sequence[float]], marked: Sequence[bool]) -> list[Series]:
+    """A cross on each marked point (x, y)."""
+    at = [point for point, mark in zip(points, marked, strict=True) if mark]
+    x, y = [point[0] for point in at], [point[1] for point in at]
+    return [Series(x=x, y=y, line="", marker="x", colour="0.35", size=70.0)] if at else []
 
 
 def _resolved(panels: Sequence[Panel]) -> list[Panel]:

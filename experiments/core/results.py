@@ -166,6 +166,8 @@ class Trace:
 
     text: str
     slots: tuple[Slot, ...]
+    right: bool | None = None
+    """Whether the answer concludes the true level; `None` where that is not known."""
 
     def __post_init__(self) -> None:
         end = 0
@@ -189,6 +191,8 @@ class RolloutExample:
       view: uint8 [H, W, 3] RGB picture of the object, or `None`.
       fields: sensor → uint8 [H, W, 3], its fields at the strongest press, drawn.
       instead: replacement of the touch → the answer to it.
+      others: other arm → its answer to the same question.
+      right: whether the answer concludes the true level; `None` where that is not known.
       group: heading that it shares with its neighbours; none by default.
     """
 
@@ -205,6 +209,8 @@ class RolloutExample:
     view: np.ndarray | None = None
     fields: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     instead: Mapping[str, Trace] = dataclasses.field(default_factory=dict)
+    others: Mapping[str, Trace] = dataclasses.field(default_factory=dict)
+    right: bool | None = None
     group: str = ""
 
     def __post_init__(self) -> None:

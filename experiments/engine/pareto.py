@@ -103,6 +103,7 @@ def run(config: GatherConfig, context: Context) -> Results:
         requirements=(dominated,) if judgements else (),
         tables=(
             default_table(judgements),
+            choice_table(judgements),
             named_table("Runs", [{"experiment": name, "run": past.summary} for name, past in runs.items()]),
         ),
         pictures=tuple(picture for name, past in runs.items() for picture in charts(name, past)),
@@ -158,6 +159,16 @@ def dominators(name: str, points: Sequence[ParetoPoint]) -> tuple[ParetoPoint, .
         return None
     best = front(points)
     return tuple(sorted((p for p in points if p.beats(named)), key=lambda p: p not in best))
+
+
+def choice_table(judgements: Sequence[DefaultJudgement]) -> Table:
+    """Every measured choice beside the defaults, and the first one of the front that dominates it."""
+    rows = []
+    for j in judgements:
+        for point in j.points:
+            by = dominators(point.name, j.points) or ()
+            rows.append({"choice": point.name, "measured in": j.title, "dominated by": by[0].name if by else "–"})
+    return named_table("Choices", rows, meanings={"dominated by": "no worse on any axis of that table, better on one"})
 
 
 def verdict(judgements: Sequence[DefaultJudgement], missing: Sequence[str]) -> tuple[str, ...]:

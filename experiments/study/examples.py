@@ -1,5 +1,6 @@
 """A few answers for the report, with the touch that they are about."""
 
+import dataclasses
 import re
 from collections.abc import Iterable, Mapping
 
@@ -20,6 +21,9 @@ FIELD_PX = 192
 
 ARROWS = 12
 """Arrows along a side of a drawn field."""
+
+SCALE_PX = 58
+"""Width of the scale beside it."""
 
 ARROW_PX = 14.0
 """Length of the longest arrow: it stays inside its cell."""
@@ -63,6 +67,11 @@ def rollouts_of(
     data, policy, answers = study.data, study.policy, study.answers[arm][0]
     terms = reward_terms(policy, answers, weights, study.prior)
 
+    def answer(found: Evaluation, row: int) -> Trace:
+        concluded, asked = found.parsed.conclude[row], answers.attribute[row]
+        right = bool(concluded[asked] == answers.label[row, asked])
+        return dataclasses.replace(marked(policy.tokenizer.decode(found.tokens[row])), right=right)
+
     def example(row: int) -> RolloutExample:
         contact = int(data.parts["test"][answers.contact[row]])
         card = data.store.objects[data.store.contacts[contact].object_id]
@@ -70,10 +79,7 @@ def rollouts_of(
         clip = make_clip(recorded, card, data.clip)
         attribute = policy.language.attributes[answers.attribute[row]]
         shown = [(s, name) for s, name in enumerate(data.clip.sensors) if clip.stream_mask[s]]
-        trace, reward = (
-            marked(policy.tokenizer.decode(answers.tokens[row])),
-            {name: float(values[row]) for name, values in terms.items()},
-        )
+        trace, reward = answer(answers, row), {name: float(values[row]) for name, values in terms.items()}
         return RolloutExample(
             arm=arm,
             object_id=card.object_id,
@@ -87,7 +93,9 @@ def rollouts_of(
             force_n={name: clip.force_n[s][clip.frame_mask[s]] for s, name in shown},
             view=card.view,
             fields={name: drawn for _, name in shown if (drawn := field_picture(recorded[name])) is not None},
-            instead={name: marked(policy.tokenizer.decode(o.tokens[row])) for name, o in instead.items()},
+            instead={name: answer(o, row) for name, o in instead.items()},
+            others={n: answer(o[0], row) for n, o in study.answers.items() if o and n != arm and n not in instead},
+            right=trace.right,
             group=group,
         )
 
@@ -97,7 +105,7 @@ def rollouts_of(
 def field_picture(recording: Sequence) -> np.ndarray | None:
     """Indentation in colour and displacement as arrows at the strongest press, uint8 RGB; `None` without fields.
 
-    Colours span the frame's own depths; the longest arrow has `ARROW_PX`, so that pictures show shapes, not sizes.
+    Colours span the frame's own depths, which a scale in mm beside them states; the longest arrow has `ARROW_PX`.
     """
     t = -1 if recording.force_n is None else int(np.argmin(recording.force_n[:, 2]))
     depth, moved = recording.depth_mm, recording.deformation_mm
@@ -116,7 +124,19 @@ def field_picture(recording: Sequence) -> np.ndarray | None:
         end = start + ARROW_PX * moves[y, x] / longest
         tips = [tuple(round(float(v)) for v in point) for point in (start, end)]
         cv2.arrowedLine(picture, tips[0], tips[1], (255, 255, 255), 1, cv2.LINE_AA, tipLength=0.3)
+    if depth is not None:
+        picture = np.hstack([picture, depth_scale(float(ground.min()), float(ground.max()))])
     return np.ascontiguousarray(picture[..., ::-1])
+
+
+def depth_scale(least_mm: float, most_mm: float) -> np.ndarray:
+    """The colours of depth from the deepest to the shallowest with their figures, uint8 BGR [FIELD_PX, SCALE_PX, 3]."""
+    drawn = np.full((FIELD_PX, SCALE_PX, 3), 255, np.uint8)
+    ramp = np.linspace(255, 0, FIELD_PX).astype(np.uint8)[:, None]
+    drawn[:, 4:14] = cv2.applyColorMap(ramp, cv2.COLORMAP_VIRIDIS)
+    for text, y in ((f"{most_mm:.2f}", 12), ("mm", 26), (f"{max(least_mm, 0.0):.2f}", FIELD_PX - 4)):
+        cv2.putText(drawn, text, (17, y), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (60, 60, 60), 1, cv2.LINE_AA)
+    return drawn
 
 
 def marked(text: str) -> Trace:

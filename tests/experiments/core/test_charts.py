@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from experiments.core.charts import Panel, Rule, Series, bars, draw, speed_against_error
+from experiments.core.charts import BEATEN, Panel, Rule, Series, bars, crosses, dominated, draw, speed_against_error
 from experiments.core.curves import curves_by_phase, running_mean
 from experiments.core.look import PALETTE, colours
 from experiments.core.pictures import Heatmap, heatmaps, image_grid
@@ -80,6 +80,17 @@ def test_points_are_named_unless_missing_and_the_same_data_give_the_same_bytes()
     assert {name for name, *_ in points} <= texts(drawn)
     assert drawn == speed_against_error({"kind": points}, "error", (2.0, 0.3))
     assert "b" not in texts(draw([Panel([Series(x=[0, 1, 2], y=[0, np.nan, 4], labels=["a", "b", "c"])])]))
+
+
+def test_dominated_choices_are_crossed():
+    points = [(1.0, 2.0), (2.0, 1.0), (2.0, 2.0), (1.0, 2.0), (np.nan, 0.0)]
+    assert dominated(points) == [False, False, True, False, False]
+    (series,) = crosses(points, dominated(points))
+    assert (series.x, series.y, series.marker) == ([2.0], [2.0], "x")
+    assert crosses(points[:2], [False, False]) == []
+    named = [(str(i), *point, point[1]) for i, point in enumerate(points[:3])]
+    assert BEATEN in texts(speed_against_error({"kind": named}, "error", None))
+    assert BEATEN not in texts(speed_against_error({"kind": named[:2]}, "error", None))
 
 
 def test_a_heatmap_names_its_rows_columns_and_cells():

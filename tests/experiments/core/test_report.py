@@ -94,6 +94,7 @@ CHART = Picture(name="pareto", title="Speed", caption="left is faster", content=
 @pytest.fixture
 def results() -> Results:
     instead = {c: Trace(text=coin.TRACE, slots=coin.example().slots) for c in ("drop", "noise")}
+    others = {"unpaid": dataclasses.replace(instead["drop"], right=False)}
     fields = {"xense": np.zeros((192, 192, 3), np.uint8)}
     return Results(
         arms={"paid": row(60.0), "unpaid": row(50.0)},
@@ -103,7 +104,7 @@ def results() -> Results:
         verdict=("Being paid helps.",),
         data={"objects": {"train": 10}},
         timing={"sft/0": 1.0, "sft/1": 3.0},
-        examples=(dataclasses.replace(coin.example(), fields=fields, instead=instead),),
+        examples=(dataclasses.replace(coin.example(), fields=fields, instead=instead, others=others, right=True),),
         requirements=(FAST, SLOW),
         tables=(TABLE,),
         pictures=(CHART,),
@@ -114,6 +115,12 @@ def write(directory, results, about="Does it?\n\nPerhaps.", description=DESCRIPT
     lines = [f'{{"stage": "sft/{s}", "step": {t}, "loss": {t + s}}}\n' for s in range(2) for t in range(50)]
     write_text(directory / "metrics.jsonl", "".join(lines))
     return write_report(directory, results, about=about, description=description).read_text()
+
+
+def test_answers_are_marked_right_or_wrong_with_other_arms_beside_them(tmp_path, results):
+    page = write(tmp_path, results)
+    assert page.count("✓ right") == 1
+    assert re.search(r"unpaid</th><td> *<span class=\"wrong\">✗ wrong</span>", page.replace("\n", ""))
 
 
 def test_the_page_is_well_formed_whole_and_loads_nothing(tmp_path, results):
@@ -127,7 +134,7 @@ def test_the_page_is_well_formed_whole_and_loads_nothing(tmp_path, results):
         "NOT MET", "≥ 400 records/s", "−2.00", "winkler", "–", "left is faster", "Fields of xense",
     ):  # fmt: skip
         assert text in reader.text or text in page
-    assert page.count('class="trace"') == 3  # the answer, and those without touch
+    assert page.count('class="trace"') == 4  # the answer, that of another arm, and those without touch
     for metric in METRICS.values():
         assert metric.title in reader.text
         assert metric.meaning in reader.text

@@ -62,7 +62,8 @@ def test_the_page_names_dominated_defaults_and_shows_the_charts(tmp_path):
     finished(tmp_path, "20260101-000000", TABLE["rows"])
     directory = run_shrunk(pareto, GatherConfig(others=tmp_path), tmp_path / "first")
     results = read_json(directory / "results.json")
-    defaults, runs = results["tables"]
+    defaults, choices, runs = results["tables"]
+    assert {row[0]: row[2] for row in choices["rows"]} == {"Winkler": "–", "nested 1e-3": "–", "plain": "nested 1e-3"}
     assert [row[4:] for row in defaults["rows"]] == [[3, 2, "nothing"]]
     assert [row[0] for row in runs["rows"]] == ["pareto_contact"]
     assert results["requirements"][0]["measured"] == 0
