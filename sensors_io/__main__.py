@@ -63,7 +63,7 @@ def main(args: list[str] | None = None) -> int:
         complain(error)
         return 1
     except KeyboardInterrupt:
-        ERR.print("interrupted: run the same command again to go on")
+        ERR.print("interrupted: run the same command again to resume")
         return 130
 
 

@@ -1,4 +1,4 @@
-"""Quality filters: each names one thing that can be wrong with a frame, marks it by a flag, and deletes nothing.
+"""Quality filters: each flags frames that have one kind of fault; they never delete them.
 
 A filter takes what was recorded and returns which frames it would reject, bool [N].  Flags are bits, so a filter that
 is switched off again leaves no trace: `without` takes its bit back.

@@ -5,7 +5,7 @@
     contacts-00000.arrayrecord     one entry per `Sequence`: one contact seen by one sensor, all its frames
 
 A shard is written under a temporary name, closed, counted, synced and renamed; then the index is replaced.  A killed
-writer leaves every published contact readable, and the next one goes on behind them.
+writer leaves every published contact readable, and the next one resumes after them.
 
 Frames are stored as the differences that they want (`codec`, `deltas`) and each entry is compressed by ArrayRecord with
 zstd at level 1.  `pareto_storage` chose this by a rule; one shared core, bytes as a share of the raw frames and frames
@@ -70,7 +70,7 @@ class RecordWriter:
       path: directory of the data set; created if need be.
       meta: what the data set is.
       contacts_per_shard: contacts per published shard.
-      resume: go on behind the contacts that an earlier writer published; `contacts_done` and `objects_done` say which.
+      resume: continue after the contacts of an earlier writer; `contacts_done` and `objects_done` say which.
 
     Raises:
       RecordsExistError: the directory holds records and `resume` is off, or they were made by another config, or
@@ -323,7 +323,7 @@ def _start(root: pathlib.Path, meta: RecordsMeta, resume: bool) -> Index:
         if index.meta.config_hash != meta.config_hash:
             raise RecordsExistError(
                 f"{root} holds {_content(root, index)}, made by config {index.meta.config_hash!r}, not "
-                f"{meta.config_hash!r}: one directory holds records of one making; choose another directory, or go on "
+                f"{meta.config_hash!r}: one directory holds records of one making; choose another directory, or resume "
                 "with the options that made these; nothing was changed"
             )
         index.complete = False

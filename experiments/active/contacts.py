@@ -117,7 +117,7 @@ class ContactBank:
 
 
 def generate(config: ContactsConfig, context: Context) -> ContactBank:
-    """The bank of a configuration, generated or read from the cache; a stopped run goes on where it was."""
+    """The bank of a configuration, generated or read from the cache; a stopped run resumes."""
     folder = context.cache_dir / "touch_bank" / contacts_hash(config)
     starts = range(0, config.objects, _OBJECTS_A_FILE)
     with context.progress("contacts", config.objects) as advance:

@@ -160,7 +160,7 @@ def verdict(
         return (
             f"The warm start answers {mean('by_question')} after the best touch for each question, "
             f"{against('by_question', 'no_touch')} points over no touch: it does not read touches, so that this run "
-            "says nothing about choosing them.",
+            "does not answer how to choose them.",
         )
     number = np.mean([f[several].contacts.mean() for f in seeds])
     return (

@@ -1,6 +1,6 @@
 """The context of a run: directories, log, progress, and the stages that are already done.
 
-A *stage* is a piece of work that is done once and remembered, named `PHASE/SEED` or `PHASE/ARM/SEED`, for example
+Each computation is a cached *stage*, named `PHASE/SEED` or `PHASE/ARM/SEED`, for example
 `sft/0` and `grpo/ordinal/0`; the report takes phases, arms and seeds of the curves from these names.
 """
 
@@ -89,7 +89,7 @@ class Context:
 
     Args:
       directory: `runs/NAME/STAMP`.
-      cache_dir: data shared between runs; whatever is stored there must be named by the hash of what made it.
+      cache_dir: data shared between runs; every entry must be named by the hash of its inputs.
       console: for people.
       watchers: called with every logged line and every loop.
       stopping: receives the signals that ask the run to stop; the default receives none.

@@ -114,6 +114,6 @@ def run_loop(
     make_log: MakeLog | None = None,
     held_out: Callable[[Any], float] | None = None,
 ) -> Any:
-    """Call `fit` with `stage_hooks`: a stopped stage goes on from its newest checkpoint and ends in the same state."""
+    """Call `fit` with `stage_hooks`: a stopped stage resumes from its newest checkpoint with bit-identical results."""
     with stage_hooks(context, stage, loop.steps, make_log=make_log, scored=held_out is not None) as hooks:
         return fit(step, state, batches, loop, hooks, held_out=held_out)

@@ -80,8 +80,8 @@ def require_same(before: Mapping[str, Any] | None, where: object) -> None:
     found = () if before is None else changed(before, settings())
     if found:
         raise ConfigurationError(
-            f"{where} cannot be continued to the same bits: {'; '.join(found)}; set them as they were, or start a new "
-            "run with --fresh"
+            f"{where} cannot be resumed with bit-identical results: {'; '.join(found)}; set them as they were, or "
+            "start a new run with --fresh"
         )
 
 

@@ -1,4 +1,4 @@
-"""Does training that is killed, starved or fed nonsense end in the same bits, or name what is wrong?
+"""Does training that is killed or gets damaged input end with bit-identical results, or name the fault?
 
     make experiment EXP=stability_faults [ARGS="--scale smoke"]
 
@@ -319,7 +319,7 @@ def damage_table(damage: Sequence[Damage]) -> Table:
         by_kind.setdefault(f"{one.file}, {one.damage}", []).append(one)
     count = lambda same: {outcome: sum(one.outcome == outcome for one in same) for outcome in OUTCOMES}
     return named_table(
-        "Damaged files of a run that goes on",
+        "Damaged files of a resumed run",
         [{"damage": kind, **count(same), "said": same[0].message[:CELL]} for kind, same in by_kind.items()],
         note="All files of the newer of two checkpoints, and those of the run that its next session reads.",
     )

@@ -45,7 +45,7 @@ class SourceConfig:
 
 
 def prepare_records(config: SourceConfig, context: Context) -> Path:
-    """Directory of the records, made or imported first where the cache lacks them; an interrupted making goes on."""
+    """Directory of the records, made or imported first where the cache lacks them; an interrupted one resumes."""
     if config.data_dir is None:
         path = context.cache_dir / f"scenes-{config_hash(config.scenes)}"
         _make(context, "making scenes", lambda report: generate_records(config.scenes, path, progress=report))

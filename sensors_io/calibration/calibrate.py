@@ -187,7 +187,7 @@ def _enough(presses: BallPresses, names: tuple[str, ...], bad: dict[int, str], c
 def _check_window(presses: BallPresses, config: CalibrateConfig) -> None:
     """A window of the size of a coin or of a hand is a wrong pitch, such as that of pictures of another resolution.
 
-    Nothing in the pictures tells it: they look the same under half the ball in half the window.
+    Measure the sensing window; images alone do not determine scale.
     """
     low, high = config.window_mm
     rows_mm, columns_mm = (side * presses.mm_per_px for side in presses.shape)

@@ -98,7 +98,7 @@ def report_table(made: Calibration, report: CalibrationReport) -> Table:
     table = Table("what", "figure or reason", title=f"calibration of {made.sensor}")
     table.add_row("presses used", str(len(report.kept)))
     rows_mm, columns_mm = (side * made.mm_per_px for side in made.background.shape[:2])
-    table.add_row("the picture shows, mm (hold a ruler to it)", f"{columns_mm:.1f} × {rows_mm:.1f}")
+    table.add_row("sensing window, mm (measure it)", f"{columns_mm:.1f} × {rows_mm:.1f}")
     contact_mm = float(np.median(report.touches.radius_px)) * made.mm_per_px
     table.add_row("radius of the contacts, mm (median)", f"{contact_mm:.2f}")
     table.add_row("strength of the smoothness prior", f"{report.choice.ridge:.0e}")

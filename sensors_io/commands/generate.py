@@ -13,7 +13,7 @@ from sensors_io.schema import SENSORS
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Generate:
-    """Generate scenes.  An interrupted generation goes on where it stopped.
+    """Generate scenes.  An interrupted generation resumes.
 
     `--objects 1000 --sequences 14700` is the set of the paper's size: 1.32 million records.
     """

@@ -148,7 +148,7 @@ DataSet = (
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Import:
-    """Import published recordings.  An interrupted import goes on where it stopped."""
+    """Import published recordings.  An interrupted import resumes."""
 
     dataset: DataSet
 

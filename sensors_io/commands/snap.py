@@ -27,7 +27,7 @@ class Snap(Bench):
     """Take the pictures that `calibrate` needs, with guidance: the gel at rest, then presses of a ball all over it.
 
     Open the printed address: the page shows the circle found, what the presses cover, and where to press next.
-    Interrupted, the same command goes on with the presses that it has.
+    After an interruption the same command resumes with the presses that it has.
     """
 
     out: pathlib.Path

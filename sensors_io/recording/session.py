@@ -89,7 +89,7 @@ def record_session(
     view: ObjectView | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Report:
-    """Record what is missing of a session; a second call goes on behind the first, and a replay that ends ends it.
+    """Record what is missing of a session; a second call resumes after the first; the end of a replay ends it.
 
     Args:
       out: directory of the records.

@@ -74,7 +74,7 @@ def local_rows(mesh: Mesh, batch_size: int) -> np.ndarray:
     """Rows of a batch that the devices of this process hold, ascending: all that it must read.
 
     A pipeline that draws the rows of the whole batch and then reads these gives the same batches whatever the number of
-    processes, so that a run goes on with another number of them.
+    processes, so that a run can resume with another number of them.
 
     Raises:
       ValueError: as `batch_shardings`.

@@ -234,7 +234,7 @@ class Checkpoints:
     def _unsaved(self, error: Exception) -> CheckpointError:
         return CheckpointError(
             f"{self._directory}: the last checkpoint did not reach the disk ({_brief(error)}); the one before it is "
-            "whole: free some space or make the folder writable, then go on"
+            "whole: free some space or make the folder writable, then resume"
         )
 
 
