@@ -11,9 +11,9 @@ policy's own beliefs.  Controls: touches at random, the best press, the best tou
 each question (all looked up on validation objects), a look-up order with a threshold on belief, imitation of a one-step
 look-ahead, a policy whose observations are hidden while it chooses, every touch, the exact optimum over trees.
 
-Cost: 77 minutes beside other work, 64 of them of user CPU time, with contacts that were made before: the first seed, which
-trains all arms, 36 minutes, each further seed eight to twelve.  The contacts take about thirteen minutes of CPU time,
-once (`smoke` one minute and a half).
+Cost: 77 minutes beside other work, 64 of them of user CPU time, with contacts that were made before: the first seed,
+which trains all arms, 36 minutes, each further seed eight to twelve.  The contacts take about thirteen minutes of CPU
+time, once (`smoke` one minute and a half).
 
 Expected, and found in the recorded run: one touch chosen by reward is seven points better than the best touch for all
 questions and as good as the best touch for each question.  A second touch adds little, and a policy that pays for harm
