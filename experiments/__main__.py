@@ -5,7 +5,7 @@ import os
 import signal
 import sys
 
-from experiments.core.commands import ASKING, print_error, run_command
+from experiments.core.commands import ASKING, SWEEP, print_error, run_command
 
 SIGNALLED = 128
 """Exit statuses above it are those of a run that a signal stopped."""
@@ -34,6 +34,10 @@ def main() -> None:
             from experiments.ask.command import run_asking
 
             leave(run_asking(arguments))
+        if arguments and arguments[0] == SWEEP:
+            from experiments.core.sweep import main as sweep
+
+            leave(sweep(arguments[1:]))
         status = run_command(arguments, "experiments")
         if status is None:
             from experiments.core.runner import run  # JAX and charts, which only runs need

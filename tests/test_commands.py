@@ -13,8 +13,9 @@ import tyro
 
 from experiments.ask.command import AskingCommand
 from experiments.bench.__main__ import Command as Bench
-from experiments.core.commands import ASKING, COMMANDS, Command, find
+from experiments.core.commands import ASKING, COMMANDS, SWEEP, Command, find
 from experiments.core.runner import parse
+from experiments.core.sweep import SweepCommand
 from sensors_io.__main__ import read as sensors_command
 from touchr1_jax.models.load import Load
 from touchr1_jax.rewards.__main__ import Command as Rewards
@@ -68,6 +69,9 @@ def read(module: str, arguments: str) -> None:
         parse(importlib.import_module(EXPERIMENTS[words[0]].module).EXPERIMENT, words[1:], "")
     elif module == "experiments" and words[0] not in {"NAME", "EXPERIMENT", *WRITTEN_BY_TUTORIAL}:
         assert words[0] in COMMANDS, f"there is no experiment {words[0]!r}"
+        if words[0] == SWEEP:
+            tyro.cli(SweepCommand, args=words[1:], return_unknown_args=True)
+            return
         kind: object = AskingCommand if words[0] in ASKING else Command
         tyro.cli(kind, args=words, config=(tyro.conf.OmitArgPrefixes,))
     elif module == "touchr1_jax.models.load":

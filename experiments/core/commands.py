@@ -1,4 +1,4 @@
-"""The commands next to the experiments: list them with their runs, start a new one, compare two runs."""
+"""The commands next to the experiments: list them with their runs, start a new one, compare and show runs."""
 
 import ast
 import dataclasses
@@ -19,7 +19,8 @@ PROG = "python -m experiments"
 USAGE = f"""usage: {PROG} NAME [--scale smoke|default|…] [--fresh] [--tensorboard] [--distributed] [overrides]
        {PROG} list [NAME]            experiments, their runs, cost and results
        {PROG} new NAME [--reward]    a template that runs
-       {PROG} compare RUN_A RUN_B    two runs, figure by figure
+       {PROG} compare RUN RUN […]     runs, figure by figure
+       {PROG} sweep NAME --vary OPTION=VALUE,VALUE   a run for each value
        {PROG} show NAME              the recorded result of an experiment as its report
        {PROG} ask [POLICY] INPUT     ask a trained policy about a touch
        {PROG} export POLICY FOLDER   a trained policy as a folder for others
@@ -29,7 +30,10 @@ USAGE = f"""usage: {PROG} NAME [--scale smoke|default|…] [--fresh] [--tensorbo
 ASKING = ("ask", "export", "demo")
 """Commands on trained policies, which `experiments.ask` defines."""
 
-COMMANDS = ("list", "new", "compare", "show", *ASKING)
+SWEEP = "sweep"
+"""Command that `experiments.core.sweep` defines."""
+
+COMMANDS = ("list", "new", "compare", SWEEP, "show", *ASKING)
 """Names that no experiment can have."""
 
 
@@ -86,7 +90,7 @@ class ListCommand:
         """Print the list and return the exit status."""
         entries = find(package)
         if self.name and self.name not in entries:
-            print_error(_unknown_name(self.name, entries))
+            print_error(unknown_name(self.name, entries))
             return 2
         if self.name:
             print_lines(*_listing_of_runs(self.name, entries[self.name].question, self.runs_dir))
@@ -122,13 +126,12 @@ class NewCommand:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CompareCommand:
-    """Compare two finished runs: settings, code, every figure.
+    """Compare two or more finished runs: settings, code, every figure, those that all of them have first.
 
     A run is its directory, `NAME/STAMP`, or `NAME` for the latest of an experiment.
     """
 
-    run_a: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN_A")]
-    run_b: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN_B")]
+    runs: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN RUN [RUN ...]")]
     runs_dir: Path = Path("runs")
     """Folder of all runs."""
     most: int = 40
@@ -140,8 +143,8 @@ class CompareCommand:
         from experiments.core.compare import ComparisonError, compare_runs  # SciPy, which no other command needs
 
         try:
-            a, b = (runs.read_run(runs.locate(name, self.runs_dir)) for name in (self.run_a, self.run_b))
-            print_lines(compare_runs(a, b, self.most))
+            found = [runs.read_run(runs.locate(name, self.runs_dir)) for name in self.runs]
+            print_lines(compare_runs(found, self.most))
         except (ComparisonError, DamagedFileError, FileNotFoundError) as error:
             print_error(f"{type(error).__name__}: {error}")
             return 1
@@ -163,7 +166,7 @@ class ShowCommand:
 
         entries = find(package)
         if self.name not in entries:
-            print_error(_unknown_name(self.name, entries))
+            print_error(unknown_name(self.name, entries))
             return 2
         try:
             lines = show_recorded(self.name, entries[self.name].module, self.runs_dir)
@@ -184,7 +187,7 @@ Command = (
 
 def run_command(arguments: Sequence[str], package: str) -> int | None:
     """Run one of `COMMANDS`, print help, or correct a name; the exit status, `None` where an experiment is named."""
-    if arguments and arguments[0] in COMMANDS and arguments[0] not in ASKING:
+    if arguments and arguments[0] in COMMANDS and arguments[0] not in (*ASKING, SWEEP):
         return tyro.cli(Command, args=arguments, prog=PROG, config=(tyro.conf.OmitArgPrefixes,)).run(package)
     entries = find(package)
     if not arguments or arguments[0] in ("-h", "--help"):
@@ -192,11 +195,12 @@ def run_command(arguments: Sequence[str], package: str) -> int | None:
         return 0 if arguments else 2
     if arguments[0] in entries:
         return None
-    print_error(f"{_unknown_name(arguments[0], entries)}\n{_listing(entries)}")
+    print_error(f"{unknown_name(arguments[0], entries)}\n{_listing(entries)}")
     return 2
 
 
-def _unknown_name(name: str, entries: Mapping[str, CatalogueEntry]) -> str:
+def unknown_name(name: str, entries: Mapping[str, CatalogueEntry]) -> str:
+    """The answer to a name that no experiment has, with those that resemble it."""
     close = difflib.get_close_matches(name, entries)
     return f"There is no experiment {name!r}." + (f" Did you mean {' or '.join(close)}?" if close else "")
 

@@ -1,8 +1,10 @@
-"""Comparison of two runs: settings, code, machine, and every figure that differs."""
+"""Comparison of runs: settings, code, machine, and every figure that differs."""
 
 import math
-from collections.abc import Iterator, Mapping
-from typing import Any, Literal, NamedTuple, cast, get_args
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from string import ascii_uppercase
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -10,10 +12,15 @@ from experiments.core.runs import PastRun, continuing
 from experiments.core.text import ABSENT, aligned, bounds, duration, interval, number
 from touchr1_jax.bench.statistics import student_interval
 
-Verdict = Literal["0 lies outside", "differs", "only in A", "only in B", "may be chance", "same"]
+Verdict = Literal["0 lies outside", "differs", "may be chance", "same"]
 """With paired seeds: 0 lies outside the interval of the difference, or the difference may be chance; else `differs`.
 
 The most important is the first."""
+
+GRAVITY = get_args(Verdict)
+
+ABSENT_IN = "only in"
+"""Begins the verdict on a figure that some runs lack."""
 
 CHANCE = 0.05
 """Rate at which a 95 % interval of no difference excludes 0."""
@@ -24,59 +31,78 @@ class ComparisonError(ValueError):
 
 
 class ComparedFigure(NamedTuple):
-    """One figure of both runs as it is shown; `change` is B − A, with its interval where seeds are paired."""
+    """One figure of all runs as it is shown.
+
+    Of two runs `change` is B − A, with its interval where seeds are paired; of more, it names those that differ from A.
+    `verdict` is the gravest `Verdict` over the others, or "only in" and the runs that have the figure.
+    """
 
     where: str
-    a: str
-    b: str
+    shown: tuple[str, ...]
     change: str
-    verdict: Verdict
+    verdict: str
 
 
-def compare_runs(a: PastRun, b: PastRun, most: int) -> str:
-    """Compare two runs as text: runs, differing settings, at most `most` figures that differ, cost.
+def compare_runs(runs: Sequence[PastRun], most: int) -> str:
+    """Compare runs as text: runs, differing settings, at most `most` figures that differ, shared ones first, cost.
 
     Raises:
-      ComparisonError: the same run twice, an unfinished run, or two runs without a common figure.
+      ComparisonError: fewer than two runs, the same run twice, an unfinished run, or runs without a common figure.
     """
-    if a.directory == b.directory:
-        raise ComparisonError(f"RUN_A and RUN_B are both {a.directory}: must be two runs; name them by NAME/STAMP")
-    for run in (a, b):
+    if len(runs) < 2:
+        raise ComparisonError(f"{len(runs)} run is named: must be at least two; name another")
+    again = next((run for i, run in enumerate(runs) if run.directory in [r.directory for r in runs[:i]]), None)
+    if again is not None:
+        raise ComparisonError(f"{again.directory} is named twice: must be different runs; name them by NAME/STAMP")
+    for run in runs:
         if run.results is None:
             raise ComparisonError(
                 f"{run.directory} is {run.state}: must be finished to be compared; "
                 f"continue it with: {continuing(run.description['command'])}"
             )
-    figures = list(compare_results(a.results or {}, b.results or {}))
-    if all(f.verdict in ("only in A", "only in B") for f in figures):
+    names = (
+        ascii_uppercase[: len(runs)] if len(runs) <= len(ascii_uppercase) else [str(i + 1) for i in range(len(runs))]
+    )
+    found = list(compare_results(*(run.results or {} for run in runs), names=names))
+    if not any(ABSENT_IN not in f.verdict for f in found):
         raise ComparisonError(
-            f"{a.directory} ({a.name}) and {b.directory} ({b.name}) have no figure in common; "
-            "compare two runs of one experiment"
+            f"{' and '.join(f'{run.directory} ({run.name})' for run in runs)} have no figure in common; "
+            "compare runs of one experiment"
         )
-    settings = ({"scale": r.description["scale"]} | r.description["config"] for r in (a, b))
-    code = ({"code": r.code} | r.description["versions"] | r.description["machine"] for r in (a, b))
-    cost = (ABSENT if run.seconds is None else duration(run.seconds) for run in (a, b))
+    settings = [{"scale": r.description["scale"]} | r.description["config"] for r in runs]
+    code = [{"code": r.code} | r.description["versions"] | r.description["machine"] for r in runs]
+    cost = (
+        f"{name} {ABSENT if run.seconds is None else duration(run.seconds)}"
+        for name, run in zip(names, runs, strict=True)
+    )
     parts = [
-        aligned([("A", a.name, a.summary), ("B", b.name, b.summary)]),
-        _differences("Different settings", *settings),
-        _differences("Different code or machine", *code),
-        _figures_block(figures, most),
-        "Cost: A {}, B {}".format(*cost),
+        aligned([(name, run.name, run.summary) for name, run in zip(names, runs, strict=True)]),
+        _differences("Different settings", names, settings),
+        _differences("Different code or machine", names, code),
+        _figures_block(found, names, most),
+        f"Cost: {', '.join(cost)}",
     ]
     return "\n\n".join(parts)
 
 
-def compare_results(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[ComparedFigure]:
-    """Compare every figure of two `results.json`: arms and baselines, requirements, cells of tables."""
-    one, two = _figures(a), _figures(b)
-    for where in one | two:
-        change, verdict = "", cast(Verdict, "only in A" if where in one else "only in B")
-        if where in one and where in two:
-            change, verdict = _compare(one[where], two[where])
-        yield ComparedFigure(where, _shown(one.get(where)), _shown(two.get(where)), change, verdict)
+def compare_results(*results: Mapping[str, Any], names: Sequence[str] = ascii_uppercase) -> Iterator[ComparedFigure]:
+    """Compare every figure of several `results.json`: arms and baselines, requirements, cells of tables."""
+    every = [figures(one) for one in results]
+    for where in dict.fromkeys(name for one in every for name in one):
+        shown = tuple(_shown(one.get(where)) for one in every)
+        having = [name for name, one in zip(names, every, strict=False) if where in one]
+        if len(having) < len(every):
+            yield ComparedFigure(where, shown, "", f"{ABSENT_IN} {', '.join(having)}")
+            continue
+        against = [_compare(every[0][where], one[where]) for one in every[1:]]
+        verdict = min((v for _, v in against), key=GRAVITY.index)
+        change = against[0][0]
+        if len(against) > 1:
+            change = ", ".join(n for n, (_, v) in zip(names[1:], against, strict=False) if v == verdict != "same")
+        yield ComparedFigure(where, shown, change, verdict)
 
 
-def _figures(results: Mapping[str, Any]) -> dict[str, Any]:
+def figures(results: Mapping[str, Any]) -> dict[str, Any]:
     """Name → estimate, requirement or cell of a table; rows of one name are numbered."""
     arms = {**results.get("arms", {}), **results.get("baselines", {})}
     found = {f"{name} {metric}": value for name, row in arms.items() for metric, value in row.items()}
@@ -116,29 +142,33 @@ def _shown(value: Any) -> str:
     return ABSENT if value is None else str(value)
 
 
-def _figures_block(figures: list[ComparedFigure], most: int) -> str:
-    """The number of figures of each verdict, and the figures that differ."""
-    counts = {verdict: sum(f.verdict == verdict for f in figures) for verdict in get_args(Verdict)}
-    head = f"{len(figures)} figures; " + "; ".join(f"{verdict}: {count}" for verdict, count in counts.items() if count)
+def _figures_block(found: Sequence[ComparedFigure], names: Sequence[str], most: int) -> str:
+    """The number of figures of each verdict, and the figures that differ, those that all runs have first."""
+    rank = lambda verdict: GRAVITY.index(verdict) if verdict in GRAVITY else len(GRAVITY)
+    counts = Counter(f.verdict for f in found)
+    verdicts = sorted(counts, key=rank)
+    head = f"{len(found)} figures; " + "; ".join(f"{verdict}: {counts[verdict]}" for verdict in verdicts)
     paired = counts["0 lies outside"] + counts["may be chance"]
     if paired:
         head += f" (of {paired} intervals, chance alone excludes 0 from {paired * CHANCE:.1f})"
-    differing = sorted((f for f in figures if f.verdict != "same"), key=lambda f: list(counts).index(f.verdict))
+    differing = sorted((f for f in found if f.verdict != "same"), key=lambda f: rank(f.verdict))
     if not differing:
         return head
     left = f"\n… and {len(differing) - most} more; --most shows them" if len(differing) > most else ""
-    return f"{head}\n{aligned([('figure', 'A', 'B', 'B − A', ''), *differing[:most]])}{left}"
+    change = f"{names[1]} − {names[0]}" if len(names) == 2 else f"from {names[0]} differ"
+    rows = [(f.where, *f.shown, f.change, f.verdict) for f in differing[:most]]
+    return f"{head}\n{aligned([('figure', *names, change, ''), *rows])}{left}"
 
 
-def _differences(title: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> str:
-    """The leaves of two nested mappings that are not equal."""
-    one, two = (dict(_leaves(tree)) for tree in (a, b))
-    rows = [
-        (key, str(one.get(key, ABSENT)), str(two.get(key, ABSENT)))
-        for key in one | two
-        if key not in one or key not in two or one[key] != two[key]
-    ]
-    return f"{title}:\n{aligned([('', 'A', 'B'), *rows])}" if rows else f"{title}: nothing"
+def _differences(title: str, names: Sequence[str], every: Sequence[Mapping[str, Any]]) -> str:
+    """The leaves of nested mappings that are not equal in all of them."""
+    flat = [dict(_leaves(tree)) for tree in every]
+    rows = []
+    for key in dict.fromkeys(key for one in flat for key in one):
+        values = [one.get(key, ABSENT) for one in flat]
+        if any(value != values[0] for value in values):
+            rows.append((key, *map(str, values)))
+    return f"{title}:\n{aligned([('', *names), *rows])}" if rows else f"{title}: nothing"
 
 
 def _leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -23,7 +23,7 @@ from experiments.core.artifacts import (
     write_sealed,
     write_text,
 )
-from experiments.core.progress import Advance, Loop, ProgressCallback, Watcher, show_progress
+from experiments.core.progress import Advance, Loop, ProgressCallback, TrainingSample, Watcher, show_progress
 from experiments.core.stopping import Stopping
 from sensors_io.json_files import CHECKSUM, seal, unseal
 from touchr1_jax.distributed.processes import SINGLE_PROCESS, ProcessGroup, SingleDevice
@@ -137,6 +137,11 @@ class Context:
         if self._log is not None:
             self._log.append(stage, step, scalars)
 
+    def sampled(self, stage: str, step: int, sample: TrainingSample) -> None:
+        """Show an answer of the policy that a stage trains; it is not logged."""
+        for watcher in self._watchers:
+            watcher.sampled(stage, step, sample)
+
     def rewind(self, stage: str, step: int) -> None:
         """Drop the logged lines of a stage at or past a step; needed only where the first new line may come later."""
         _checked(stage)
@@ -144,12 +149,15 @@ class Context:
             self._log.rewind(stage, step)
 
     @contextlib.contextmanager
-    def progress(self, title: str, total: int, completed: int = 0, *, still: bool = False) -> Iterator[Advance]:
+    def progress(
+        self, title: str, total: int, completed: int = 0, *, still: bool = False, note: str = ""
+    ) -> Iterator[Advance]:
         """Show a progress bar for one loop of `total` steps, of which earlier sessions `completed` some.
 
-        A `still` bar and those inside are redrawn with each step only, so that they take no time from what is timed.
+        Until the first step the `note` stands beside it.  A `still` bar and those inside are redrawn with each step
+        only, so that they take no time from what is timed.
         """
-        loop = Loop(title, total, completed, still=still or any(outer.still for outer in self.loops))
+        loop = Loop(title, total, completed, still=still or any(outer.still for outer in self.loops), note=note)
         self.loops.append(loop)
 
         def notify() -> None:

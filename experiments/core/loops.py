@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 from experiments.core.context import Context
+from experiments.core.progress import TrainingSample
 from experiments.core.results import Table, named_table
 from touchr1_jax.rl.scoring import NONFINITE_IN
 from touchr1_jax.training.checkpoint import Checkpoints
@@ -16,6 +17,9 @@ STEPPING, WAITING = "in steps", "waiting for data"
 KEPT = "kept"
 """Stages whose result is the share of a stage's adapters that its merged weights keep (see `lora.kept_share`)."""
 
+
+COMPILING = "compiling the first step"
+"""Note beside the bar of a stage until its first step is done."""
 
 MakeLog = Callable[[Context, str, int], Log]
 """From the run, a stage and its first step to what receives (step, metrics)."""
@@ -29,6 +33,7 @@ def stage_hooks(
     *,
     make_log: MakeLog | None = None,
     scored: bool = False,
+    describe: Callable[[Any], TrainingSample] | None = None,
 ) -> Iterator[Hooks]:
     """Hooks that make a training stage part of a run; inside the block the stage is timed.
 
@@ -38,6 +43,7 @@ def stage_hooks(
       steps: of the whole stage, for the progress bar.
       make_log: by default the metrics are logged unchanged.
       scored: keep the checkpoint of the highest held-out score too.
+      describe: of the sample that a step returns, what people see; without it no step returns one.
     """
     times, logs, left_out = LoopTime(), list[Log](), [0.0]
     folder = context.checkpoint_dir(stage)
@@ -51,10 +57,9 @@ def stage_hooks(
         def resumed(start: int) -> None:
             context.require_logged(stage, start)
             context.rewind(stage, start)
-            write: Log = lambda t, metrics: context.log(stage, t, **metrics)
-            if make_log is not None:
-                write = make_log(context, stage, start)
-            advance = bar.enter_context(context.progress(stage, steps, min(start, steps)))
+            plain: Log = lambda t, metrics: context.log(stage, t, **metrics)
+            write = plain if make_log is None else make_log(context, stage, start)
+            advance = bar.enter_context(context.progress(stage, steps, min(start, steps), note=COMPILING))
 
             def log(t: int, metrics: dict[str, float]) -> None:
                 left_out.append(metrics.get(SKIPPED, 0.0))
@@ -71,6 +76,7 @@ def stage_hooks(
             merged=lambda kept: context.save_stage(f"{KEPT}/{stage}", kept),
             times=times,
             devices=context.devices,
+            sampled=None if describe is None else lambda t, sample: context.sampled(stage, t, describe(sample)),
         )
         bar.close()
         if max(left_out):

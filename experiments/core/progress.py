@@ -1,6 +1,7 @@
 """Progress of loops: a bar with rate and time left, or plain lines where the output is no terminal."""
 
 import contextlib
+import dataclasses
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
@@ -49,6 +50,7 @@ class Loop:
       total: steps of the whole loop.
       completed: steps of earlier sessions; they do not count into the rate.
       still: redraw with each step only, not ten times a second, which would take time from what is timed.
+      note: shown beside the bar until the first of its steps, such as "compiling".
       clock: seconds.
     """
 
@@ -59,9 +61,11 @@ class Loop:
         completed: int = 0,
         *,
         still: bool = False,
+        note: str = "",
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.title, self.total, self.completed, self.still, self.note = title, total, completed, still, ""
+        self.title, self.total, self.completed, self.still = title, total, completed, still
+        self.note = note if completed < total else ""
         self._clock = clock
         self._began = self._first_call = (completed, clock())
 
@@ -100,6 +104,16 @@ class Loop:
         return f"{'at most ' * self._only_one_call}{duration((self.total - self.completed) / self.rate)}"
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrainingSample:
+    """An answer that a policy gave while it was trained: what was asked, its words, the truth, what it earned."""
+
+    question: str
+    answer: str
+    truth: str
+    reward: float
+
+
 class Watcher:
     """Base of whatever follows a run: it is called with every logged line and every loop; here it does nothing."""
 
@@ -111,6 +125,9 @@ class Watcher:
 
     def looping(self, loops: Sequence[Loop]) -> None:
         """A loop began, advanced or ended; `loops` are the open ones, the outermost first."""
+
+    def sampled(self, stage: str, step: int, sample: TrainingSample) -> None:
+        """A policy answered in a step of a stage."""
 
     def closed(self) -> None:
         """The session is over."""
@@ -152,7 +169,7 @@ def _bar(console: Console, loop: Loop, every_s: float) -> Iterator[Callable[[], 
         TextColumn("{task.fields[note]}", style="dim", markup=False),
     )
     with Progress(*columns, console=console, auto_refresh=not loop.still) as bar:
-        task = bar.add_task(loop.title, total=loop.total, completed=loop.completed, note="")
+        task = bar.add_task(loop.title, total=loop.total, completed=loop.completed, note=loop.note)
         yield lambda: bar.update(task, completed=loop.completed, note=loop.note, refresh=loop.still)
 
 
@@ -179,6 +196,8 @@ def _plain_lines(console: Console, loop: Loop, every_s: float) -> Iterator[Calla
         line = f"{loop.title}: {loop.completed}/{loop.total}, {loop.rate:.3g}/s, {duration(loop.elapsed_s)}{left}{note}"
         console.print(line, markup=False, highlight=False, soft_wrap=True)
 
+    if loop.note:
+        console.print(f"{loop.title}: {loop.note}", markup=False, highlight=False, soft_wrap=True)
     yield lambda: print_line(every_s)
     if printed != loop.completed:
         print_line()

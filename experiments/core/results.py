@@ -50,12 +50,16 @@ def at_least(name: str, measured: float, bound: float, unit: str = "", note: str
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Column:
-    """One column of a table: heading, unit, format of its numbers, what it means."""
+    """One column of a table: heading, unit, format of its numbers, what it means.
+
+    With `link`, the name of a page, each cell is a folder and leads to that page in it.
+    """
 
     name: str
     unit: str = ""
     format: str = ".3g"
     meaning: str = ""
+    link: str = ""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -1,7 +1,7 @@
 """Find an experiment, resolve its configuration, run or continue it, write its report.
 
-    python -m experiments NAME [--scale smoke|default] [--fresh] [--tensorboard] [--distributed] [overrides]
-    python -m experiments list | new | compare
+    python -m experiments NAME [--scale smoke|default] [--fresh] [--tensorboard] [--wandb] [--distributed] [overrides]
+    python -m experiments list | new | compare | sweep | show
 
 An experiment is a module of this package.  It opens with a docstring, whose first line is the question, followed by the
 command, the cost and the expected result, and it defines `EXPERIMENT`.
@@ -11,9 +11,12 @@ import contextlib
 import dataclasses
 import functools
 import importlib
+import io
 import itertools
+import re
 import shlex
 import sys
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Generic, Literal, TypeVar
@@ -30,7 +33,7 @@ from experiments.core.memory import require_memory
 from experiments.core.report import write_report
 from experiments.core.results import Results
 from experiments.core.stopping import Stopped, Stopping
-from experiments.core.text import MEANINGLESS, SMOKE
+from experiments.core.text import MEANINGLESS, SMOKE, aligned
 from sensors_io.errors import UserError
 from touchr1_jax.distributed.companions import DifferentProcessesError, watched
 from touchr1_jax.distributed.processes import (
@@ -53,6 +56,17 @@ from touchr1_jax.training.questions import NoLabelsError
 
 EVENTS = "events"
 """Folder of a run that holds its TensorBoard events."""
+
+HELP_ALL = "--help-all"
+
+FIRST = ("scale", "fresh", "seeds", "data", "data-dir", "scenes.objects", "recipe", "grpo-steps", "grpo.lr-scale")
+"""Options that help shows first, where an experiment has them; then come the experiment's own."""
+
+OF_RUNNER = ("tensorboard", "wandb", "runs-dir", "cache-dir", "distributed", "coordinator", "processes", "process")
+"""Options of every experiment."""
+
+MOST_OPTIONS, MOST_LETTERS = 10, 70
+"""Of short help: options, and letters about a group."""
 
 COMPILED = "compiled"
 """Folder of the cache for compiled programs, which later runs of the same shapes reuse."""
@@ -131,12 +145,22 @@ def main(arguments: Sequence[str] | None = None, package: str = "experiments") -
 def run(arguments: Sequence[str], package: str = "experiments") -> int:
     """Run or continue the experiment that the first argument names; returns the exit code."""
     name, *rest = arguments
+    experiment, about = load(name, package)
+    return run_experiment(experiment, rest, about)
+
+
+def load(name: str, package: str = "experiments") -> tuple[Experiment[Any], str]:
+    """An experiment of a package and its docstring.
+
+    Raises:
+      ValueError: its module names it otherwise.
+    """
     module = importlib.import_module(find(package)[name].module)
     if module.EXPERIMENT.name != name:
         raise ValueError(
             f"{module.__name__} names its experiment {module.EXPERIMENT.name!r}: must be {name!r}; rename it"
         )
-    return run_experiment(module.EXPERIMENT, rest, module.__doc__ or name)
+    return module.EXPERIMENT, module.__doc__ or name
 
 
 def run_experiment(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> int:
@@ -153,9 +177,10 @@ def run_experiment(experiment: Experiment[Any], arguments: Sequence[str], about:
     except ValueError as error:  # a configuration refuses its own values, or one is not finite
         print_error(f"{type(error).__name__}: {error}")
         return 2
-    if command.tensorboard and not watchers.tensorboard_installed():
-        print_error(watchers.TENSORBOARD_HINT)
-        return 2
+    for flag in watchers.PACKAGES:
+        if getattr(command, flag) and (hint := watchers.missing(flag)):
+            print_error(hint)
+            return 2
     if not experiment.spreads and command.launch != Launch():
         print_error(f"{experiment.name} runs in one process on one device; leave --distributed and --mesh out")
         return 2
@@ -164,14 +189,15 @@ def run_experiment(experiment: Experiment[Any], arguments: Sequence[str], about:
 
 
 def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> Any:
-    """Resolve the command line: `.scale`, `.fresh`, `.tensorboard`, two directories and the overridden `.config`.
+    """Resolve the command line: the runner's options and the overridden `.config`.
 
-    The scale is picked out first, since it chooses the defaults that everything else overrides; tyro refuses an unknown
-    one.
+    The scale is picked out first, since it chooses the defaults that everything else overrides, and choices such as
+    `grpo.algorithm:dapo` are, since their options may stand anywhere; tyro refuses unknown ones.
 
     Raises:
       SystemExit: code 2 after the correction of a typo, 0 after help.
     """
+    arguments = sorted(arguments, key=lambda word: not _chooses(word, experiment.config))
     configs, scale = experiment.configs(), "default"
     for flag, value in itertools.pairwise([*arguments, ""]):
         named = value if flag == "--scale" else flag.removeprefix("--scale=")
@@ -184,6 +210,7 @@ def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> 
             ("scale", Annotated[Literal[*configs], tyro.conf.arg(help="Set of defaults.")], scale),
             ("fresh", Annotated[bool, tyro.conf.arg(help="Start a new run though an unfinished one exists.")], False),
             ("tensorboard", Annotated[bool, tyro.conf.arg(help=events)], False),
+            ("wandb", Annotated[bool, tyro.conf.arg(help="Also send every figure to Weights & Biases.")], False),
             ("runs_dir", Annotated[Path, tyro.conf.arg(help="Folder of all runs.")], Path("runs")),
             ("cache_dir", Annotated[Path, tyro.conf.arg(help="Folder of data and compiled programs.")], Path("data")),
             ("launch", Annotated[Launch, tyro.conf.arg(name="")], Launch()),
@@ -192,8 +219,46 @@ def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> 
         kw_only=True,
         frozen=True,
     )
-    prog = f"{PROG} {experiment.name}"
-    return tyro.cli(command, args=arguments, default=command(), prog=prog, description=about)
+    options: dict[str, Any] = {"default": command(), "prog": f"{PROG} {experiment.name}", "description": about}
+    options["config"] = (tyro.conf.CascadeSubcommandArgs,)
+    if not {"-h", "--help", HELP_ALL} & set(arguments):
+        return tyro.cli(command, args=arguments, **options)
+    asked = ["--help" if word == HELP_ALL else word for word in arguments]
+    written = io.TextIOWrapper(io.BytesIO(), "utf-8")  # where tyro draws the boxes that `short_help` reads
+    with contextlib.redirect_stdout(written), contextlib.suppress(SystemExit):
+        tyro.cli(command, args=asked, **options)
+    written.seek(0)
+    text = written.read()
+    print_lines(text if HELP_ALL in arguments else short_help(text))
+    raise SystemExit(0)
+
+
+def _chooses(word: str, config: Any) -> bool:
+    """True of a word that chooses the kind of a part of the configuration, such as `grpo.algorithm:dapo`."""
+    path, colon, _ = word.partition(":")
+    part = functools.reduce(lambda tree, name: getattr(tree, name.replace("-", "_"), None), path.split("."), config)
+    return bool(colon) and dataclasses.is_dataclass(part)
+
+
+def short_help(text: str) -> str:
+    """Tyro's help with `MOST_OPTIONS` options, those of `FIRST`, then the experiment's own; the others are counted."""
+    before, *rest = re.split(r"^╭─ (.+?)(?: options)? ─*╮\n", text, flags=re.MULTILINE)
+    entries, groups = dict[str, str](), dict[str, tuple[str, str]]()
+    for title, panel in zip(rest[::2], rest[1::2], strict=True):
+        lines = [line[2:-1].rstrip() for line in panel.splitlines() if line.startswith("│")]
+        rule = next((i for i, line in enumerate(lines) if set(line) == {"─"}), -1)
+        found = re.findall(r"^--([\w.-]+)((?:.|\n(?!-))*)", "\n".join(lines[rule + 1 :]), flags=re.MULTILINE)
+        entries |= {name: f"--{name}{more.rstrip()}" for name, more in found}
+        if found and title != "options":
+            sentence = " ".join(lines[: max(rule, 0)]).partition(". ")[0].rstrip(".")
+            groups[f"--{title}.…"] = str(len(found)), textwrap.shorten(sentence, MOST_LETTERS, placeholder=" …")
+    own = [name for name in entries if "." not in name and name not in OF_RUNNER]
+    chosen = [name for name in dict.fromkeys((*FIRST, *own)) if name in entries][:MOST_OPTIONS]
+    left = ", ".join(f"--{name}" for name in entries if "." not in name and name not in chosen)
+    groups = {"others": (str(left.count("--")), left), **groups}
+    further = aligned([(title, *of) for title, of in groups.items()])
+    head = "Options that matter first:"
+    return "\n".join((before.rstrip(), "", head, *(entries[n] for n in chosen), "", f"More, with {HELP_ALL}:", further))
 
 
 def _execute(experiment: Experiment[Any], command: Any, about: str, typed: str) -> int:
@@ -212,7 +277,6 @@ def _execute(experiment: Experiment[Any], command: Any, about: str, typed: str) 
             lock = runs.locked(directory) if processes.writes else contextlib.nullcontext()
             with stopping.listening(), lock, compilations_kept(command.cache_dir / COMPILED):
                 if processes.writes:
-                    runs.point_latest(directory)
                     _announce(directory, resumed)
                 _compute(experiment, command, directory, about, stopping, processes)
     except KNOWN_ERRORS as error:
@@ -271,14 +335,16 @@ def _compute(
     usual_s = None if last is None else runs.read_run(last).seconds
     page = watchers.LivePage(directory, about=about, description=description, curves=experiment.curves, usual_s=usual_s)
     try:
-        events = [watchers.Events(directory / EVENTS)] if command.tensorboard else []
-        context = make_context(Console(), [page, *events])
+        events: list[watchers.Watcher] = [watchers.Events(directory / EVENTS)] if command.tensorboard else []
+        events += [watchers.WeightsAndBiases(directory, description)] if command.wandb else []
+        context = make_context(Console(), [watchers.Latest(directory), page, *events])
         with contextlib.closing(context), context.timed("total"), page.kept_fresh():
             results = experiment.run(command.config, context)
         tables = (*results.tables, *left_out_tables(read_metrics(directory)))
         results = dataclasses.replace(results, timing={**context.timing(), **results.timing}, tables=tables)
         report = write_report(directory, results, about=about, description=description)
         write_sealed(directory / "results.json", results.to_json(description))  # last: it marks the run as finished
+        runs.point_latest(directory)  # of a run without a loop or a line
     except BaseException as error:
         page.end(error)
         raise

@@ -1,10 +1,13 @@
-"""Watchers of a run in progress: the page that a browser reloads, and TensorBoard's event files."""
+"""Watchers of a run in progress: `latest`, the page that a browser reloads, TensorBoard's events, Weights & Biases."""
 
 import contextlib
 import importlib
 import importlib.util
+import os
+import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,9 +15,9 @@ from typing import Any
 from experiments.core.artifacts import read_json, write_text
 from experiments.core.context import read_metrics
 from experiments.core.curves import PhaseCurves, draw_phases
-from experiments.core.progress import Loop, Watcher
+from experiments.core.progress import Loop, TrainingSample, Watcher
 from experiments.core.report import render
-from experiments.core.runs import continuing
+from experiments.core.runs import continuing, point_latest
 from experiments.core.text import duration
 
 PAGE_EVERY_S = 10
@@ -28,13 +31,39 @@ MOST_PANELS = 9
 
 TENSORBOARD = "tensorboardX"
 
-TENSORBOARD_HINT = (
-    f"--tensorboard needs the package {TENSORBOARD}, which is not installed: "
-    "pip install 'touchr1-jax[tensorboard]', or leave the flag out"
-)
+WANDB = "wandb"
+
+PACKAGES = {"tensorboard": TENSORBOARD, "wandb": WANDB}
+"""Flag, which is also the name of the extra that installs it, and the package that it needs."""
+
+PROJECT = "touchr1-jax"
+"""Project of Weights & Biases, unless WANDB_PROJECT names another."""
+
+SAMPLES = 6
+"""Answers on the page of a run."""
 
 FLUSH_S = 10
 """Seconds until an event is on the disk."""
+
+
+class Latest(Watcher):
+    """Lets `runs/NAME/latest` point to a run once it begins to compute: with its first loop or its first line."""
+
+    def __init__(self, directory: Path) -> None:
+        self._directory, self._pointed = directory, False
+
+    def logged(self, stage: str, step: int, scalars: Mapping[str, Any]) -> None:
+        """It computes."""
+        self._point()
+
+    def looping(self, loops: Sequence[Loop]) -> None:
+        """It computes."""
+        self._point()
+
+    def _point(self) -> None:
+        if not self._pointed:
+            point_latest(self._directory)
+            self._pointed = True
 
 
 class LivePage(Watcher):
@@ -60,6 +89,7 @@ class LivePage(Watcher):
         self._directory, self._about, self._description = directory, about, description
         self._wanted, self._usual_s, self._clock = curves, usual_s, clock
         self._loops: Sequence[Loop] = ()
+        self._samples: deque[tuple[str, int, TrainingSample]] = deque(maxlen=SAMPLES)
         self._drawn: dict[str, tuple[int, dict[str, PhaseCurves]]] = {}
         self._writing = threading.Lock()
         self._began = self._due = self._due_curves = clock()
@@ -73,6 +103,10 @@ class LivePage(Watcher):
         """Write the page again if it is time."""
         self._loops = loops
         self.write_if_due()
+
+    def sampled(self, stage: str, step: int, sample: TrainingSample) -> None:
+        """Show the answer on the next page."""
+        self._samples.appendleft((stage, step, sample))
 
     def end(self, error: BaseException) -> None:
         """Write the last page of a session that an error or a signal ended: the cause, and how to continue."""
@@ -126,6 +160,7 @@ class LivePage(Watcher):
             verdict=(state, f"{spent}; {usual}."),
             data_title="Time so far",
             loops=tuple(self._loops),
+            samples=tuple(self._samples),
             curves={name: drawn for _, phase in self._drawn.values() for name, drawn in phase.items()},
             reload_s=reload_s,
         )
@@ -145,9 +180,15 @@ def _now() -> str:
     return time.strftime("%Y-%m-%d %H:%M:%S")
 
 
-def tensorboard_installed() -> bool:
-    """True if event files can be written."""
-    return importlib.util.find_spec(TENSORBOARD) is not None
+def missing(flag: str) -> str:
+    """The fix where the package of a flag, one of `PACKAGES`, is not installed; nothing where it is."""
+    package = PACKAGES[flag]
+    if sys.modules.get(package) is not None or (package not in sys.modules and importlib.util.find_spec(package)):
+        return ""
+    return (
+        f"--{flag} needs the package {package}, which is not installed: "
+        f"pip install 'touchr1-jax[{flag}]', or leave the flag out"
+    )
 
 
 class Events(Watcher):
@@ -183,3 +224,36 @@ class Events(Watcher):
         """Write what is left and close the files."""
         for writer in self._writers.values():
             writer.close()
+
+
+class WeightsAndBiases(Watcher):
+    """Sends every number of every logged line to Weights & Biases, with a step of its own for every stage.
+
+    A continued run goes on in the same place.  Its environment variables count, such as WANDB_MODE and WANDB_PROJECT.
+
+    Args:
+      directory, description: of the run.
+
+    Raises:
+      ModuleNotFoundError: wandb is not installed.
+    """
+
+    def __init__(self, directory: Path, description: Mapping[str, Any]) -> None:
+        name = f"{description['experiment']}-{directory.name}"
+        order = {"id": name, "name": name, "resume": "allow", "dir": str(directory), "config": description["config"]}
+        self._run = importlib.import_module(WANDB).init(
+            project=os.environ.get("WANDB_PROJECT", PROJECT), tags=[description["scale"]], **order
+        )
+
+    def rewound(self, stage: str, step: int) -> None:
+        """Count the stage's steps by themselves."""
+        self._run.define_metric(f"{stage}/*", step_metric=f"{stage}/step")
+
+    def logged(self, stage: str, step: int, scalars: Mapping[str, Any]) -> None:
+        """Send the numbers among the scalars."""
+        numbers = {f"{stage}/{name}": value for name, value in scalars.items() if isinstance(value, int | float)}
+        self._run.log({f"{stage}/step": step, **numbers})
+
+    def closed(self) -> None:
+        """Send what is left."""
+        self._run.finish()

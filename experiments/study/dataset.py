@@ -90,7 +90,7 @@ def split_parts(
       left_out: contacts that are in no part.
 
     Raises:
-      DataError: a part without a contact.
+      DataError: no object has a label, or a part has no contact.
     """
     train = store.contacts_of_split("train")
     ids = np.array([store.contacts[i].object_id for i in train])
@@ -100,6 +100,11 @@ def split_parts(
     val, test = store.contacts_of_split("val"), store.contacts_of_split("test")
     parts = {"sft": train[~kept], "grpo": train if grpo_share is None else train[kept], "val": val, "test": test}
     parts = {name: rows[~np.isin(rows, left_out)] for name, rows in parts.items()}
+    if not any(card.labels for card in store.objects.values()):
+        raise DataError(
+            f"none of the {len(store.objects)} objects has a label: label them with `python -m sensors_io label "
+            "RECORDS --labels LABELS.csv --annotator NAME`, which also deals them out to train, val and test"
+        )
     for name, rows in parts.items():
         if not len(rows):
             raise DataError(

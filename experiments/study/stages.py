@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from experiments.core.context import Context
 from experiments.core.loops import stage_hooks
+from experiments.core.progress import TrainingSample
 from experiments.study.alarm_log import alarm_log
 from experiments.study.cache import cached
 from experiments.study.dataset import Dataset
@@ -25,7 +26,9 @@ from touchr1_jax.models.policy import Features
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.rewards import make_rewards
 from touchr1_jax.rl.config import GRPOConfig, left_out
+from touchr1_jax.rl.metrics import StepSample
 from touchr1_jax.rl.scoring import ScoreFn, make_score, reward_weights
+from touchr1_jax.text.template import AND, QUESTIONS
 from touchr1_jax.training import encoding
 from touchr1_jax.training.evaluation import evaluate_policy
 from touchr1_jax.training.feeds import AnswerFeed, encoded_clips, host_touch, touch_batch
@@ -337,6 +340,19 @@ def run_decoder(
     return cached("grpo", values, arrays, train, context, stage)
 
 
+def describe_sample(policy: TouchPolicy, sample: StepSample) -> TrainingSample:
+    """An answer of a step in words."""
+    asked = [a for a, chosen in zip(policy.language.attributes, sample.asked, strict=True) if chosen]
+    levels = {a.name: level for a, level in zip(policy.language.attributes, sample.label, strict=True)}
+    known = [f"{a.name} {a.levels[levels[a.name]][0]}" for a in asked if levels[a.name] >= 0]
+    return TrainingSample(
+        question=f"{f' {AND} '.join(QUESTIONS[a.name] for a in asked)}?",
+        answer=policy.tokenizer.decode(sample.tokens).strip(),
+        truth=", ".join(known),
+        reward=float(sample.reward),
+    )
+
+
 def run_grpo(
     policy: TouchPolicy,
     arm: GRPOArm,
@@ -357,7 +373,8 @@ def run_grpo(
         order |= {"full_share": contacts.full_share}
         order |= {"evidence": None if left_out(config.algorithm.anchor) else contacts.evidence}
         feed, noise = QuestionFeed(policy, contacts.features, contacts.label, **order), contacts.noise
-        with stage_hooks(context, stage, loop.steps, make_log=alarm_log) as hooks:
+        describe = functools.partial(describe_sample, policy)
+        with stage_hooks(context, stage, loop.steps, make_log=alarm_log, describe=describe) as hooks:
             return train_grpo(policy, params, feed, arm.score, config, loop, hooks, noise=noise, lora=lora, seed=seed)
 
     if not share:

@@ -226,7 +226,8 @@ class _Session:
         if not self._config.free_s and all(stream.feed.counts.delivered for stream in self._streams):
             names = ", ".join(stream.sensor for stream in self._streams)
             raise ForceError(
-                f"{names} tells no force, which leads the protocol; give a force sensor, or record free motion"
+                f"{names} tells no force, which leads the protocol; add a force sensor, as in "
+                "+ netft --host HOST, or record free motion, as with --free-s 10"
             )
         times = [stream.time_ns(samples) for stream, samples in zip(self._streams, looked, strict=True)]
         every = np.sort(np.concatenate(times))

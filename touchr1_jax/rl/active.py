@@ -61,7 +61,7 @@ def make_active_step(
     """
     check_active_config(fns, config, budget)
     fns = dataclasses.replace(fns, cache_dtype=jnp.dtype(jnp.bfloat16)) if config.bfloat16 else fns
-    engine = ActiveEngine(fns, reward, optimizer, config, None, lambda params: params, fns.levels, budget)
+    engine = ActiveEngine(fns, reward, optimizer, config, None, lambda params: params, fns.levels, False, budget)
     return compile_step(engine, config)
 
 

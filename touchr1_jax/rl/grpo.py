@@ -40,7 +40,15 @@ from touchr1_jax.rl.counterfactual import mask_one_stream
 from touchr1_jax.rl.enumerated import LevelRewards, all_equal, level_rewards
 from touchr1_jax.rl.gradient import Experience, log_probs
 from touchr1_jax.rl.losses import over_tokens
-from touchr1_jax.rl.metrics import advantage_metrics, answer_metrics, reward_metrics, rollout_metrics, touch_metrics
+from touchr1_jax.rl.metrics import (
+    SAMPLE,
+    StepSample,
+    advantage_metrics,
+    answer_metrics,
+    reward_metrics,
+    rollout_metrics,
+    touch_metrics,
+)
 from touchr1_jax.rl.rollout import GRPOBatch, SampleConfig, encode_prompts, sample_prompts
 from touchr1_jax.rl.scoring import ScoreFn, WeightedScore, left_out_groups
 from touchr1_jax.rl.update import update_policy
@@ -127,7 +135,8 @@ def make_grpo_step(
     *,
     gather: Callable[[Params], Params] = lambda params: params,
     levels: LevelTokens | None = None,
-) -> Callable[[GRPOState, GRPOBatch, FrozenInputs], tuple[GRPOState, dict[str, Array]]]:
+    sampled: bool = False,
+) -> Callable[[GRPOState, GRPOBatch, FrozenInputs], tuple[GRPOState, dict[str, Any]]]:
     """Build the jitted step, (state, batch, frozen) → (state, metrics); the state's buffers are donated.
 
     Args:
@@ -139,6 +148,7 @@ def make_grpo_step(
       gather: all-gathers sharded weights, once before the sampling loop, which reads all of them for every token (see
         `distributed.placement.gather_params`); by default they are read as they are.
       levels: token of each level, for an algorithm that enumerates conclusions.
+      sampled: return a `metrics.StepSample` with the metrics, under the name `SAMPLE`.
 
     Raises:
       ValueError: an algorithm that samples constrained, without a constraint; one that enumerates conclusions, without
@@ -160,7 +170,7 @@ def make_grpo_step(
         raise ValueError("enumerated is set, but there are no tokens of levels; make them with `level_tokens`")
     if config.bfloat16:
         fns = dataclasses.replace(fns, cache_dtype=jnp.dtype(jnp.bfloat16))
-    return compile_step(GRPOEngine(fns, score, optimizer, config, constraint, gather, levels), config)
+    return compile_step(GRPOEngine(fns, score, optimizer, config, constraint, gather, levels, sampled), config)
 
 
 def compile_step(engine: "GRPOEngine", config: GRPOConfig) -> Callable[..., tuple[GRPOState, dict[str, Array]]]:
@@ -179,8 +189,9 @@ class GRPOEngine:
     constraint: Constraint | None
     gather: Callable[[Params], Params]
     levels: LevelTokens | None
+    sampled: bool
 
-    def step(self, state: GRPOState, batch: Any, frozen: Any) -> tuple[GRPOState, dict[str, Array]]:
+    def step(self, state: GRPOState, batch: Any, frozen: Any) -> tuple[GRPOState, dict[str, Any]]:
         """Rollouts, rewards, advantages, update."""
         key = jax.random.fold_in(state.key, state.step)
         sample_key, mask_key = jax.random.split(key)
@@ -190,6 +201,10 @@ class GRPOEngine:
             raise ValueError(f"{lag}; make it with `start_state`")
         sampler = state.behind[0] if state.behind else state.params
         group, metrics = self.rollouts(sampler, batch, frozen, sample_key, control_key)
+        sample: dict[str, Any] = {}
+        if self.sampled:
+            asked, label = group.batch.target.asked[0], group.batch.target.label[0]
+            sample[SAMPLE] = StepSample(asked, label, group.rollout.tokens[0, 0], group.reward[0, 0])
         if self.config.algorithm.candidates > 1:
             metrics |= {f"drawn_{name}": value for name, value in self.group_metrics(group).items()}
             rows = dynamic_sampling_rows(self.no_signal(group), self.config.prompts)
@@ -205,7 +220,7 @@ class GRPOEngine:
         metrics |= parts | self.group_metrics(group) | self.metrics(group, learn)
         step, behind = state.step + 1, (*state.behind, state.params)[1:]
         after = dataclasses.replace(state, params=params, opt_state=opt_state, step=step, behind=behind)
-        return self.refreshed(after), metrics
+        return self.refreshed(after), {**metrics, **sample}
 
     def rollouts(
         self, params: Params, batch: Any, frozen: Any, key: Array, control_key: Array

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import jax
 import numpy as np
 
+from touchr1_jax.rl.metrics import SAMPLE, StepSample
 from touchr1_jax.skipping import count_skipped
 from touchr1_jax.training.checkpoint import Checkpoints
 from touchr1_jax.training.compilation import return_memory
@@ -134,6 +135,7 @@ class Hooks:
       merged: receives the share of its adapters that a stage's merged weights keep (`lora.kept_share`).
       times: receives how long steps took and how long they waited for data.
       devices: where the steps run.
+      sampled: receives (step, sample) where the step returns a sample; `None` asks for none.
     """
 
     log: Log = lambda step, metrics: None
@@ -143,6 +145,7 @@ class Hooks:
     merged: Callable[[float], None] = lambda kept: None
     times: LoopTime | None = None
     devices: SingleDevice = SingleDevice()
+    sampled: Callable[[int, StepSample], None] | None = None
 
 
 SILENT = Hooks()
@@ -177,7 +180,7 @@ def fit(
     """
     start, state = resume(state, batches, hooks.checkpoints)
     hooks.resumed(start)
-    lines = _LateLines(hooks.log, config.most_skipped, _skipped_before(state))
+    lines = _LateLines(hooks, config.most_skipped, _skipped_before(state))
     batch = next(batches) if start < config.steps else None
     for t in range(start, config.steps):
         began = time.perf_counter()
@@ -236,8 +239,8 @@ class _Line(NamedTuple):
 class _LateLines:
     """Logs each step once the next one is dispatched, and judges the updates that were left out."""
 
-    def __init__(self, log: Log, most_skipped: int, skipped: int) -> None:
-        self._log, self._most, self._skipped = log, most_skipped, skipped
+    def __init__(self, hooks: Hooks, most_skipped: int, skipped: int) -> None:
+        self._log, self._sampled, self._most, self._skipped = hooks.log, hooks.sampled, most_skipped, skipped
         self._pending: _Line | None = None
 
     def put(self, line: _Line) -> None:
@@ -250,6 +253,10 @@ class _LateLines:
         if self._pending is None:
             return
         (t, metrics, counts), self._pending = self._pending, None
+        metrics = dict(metrics)
+        sample: Any = metrics.pop(SAMPLE, None)
+        if self._sampled is not None and sample is not None:
+            self._sampled(t, jax.device_get(sample))
         values = {**fetch(metrics), **further}
         if counts is None:
             self._log(t, values)
@@ -269,7 +276,7 @@ class _LateLines:
 
 def _computed(metrics: dict[str, Any]) -> bool:
     """True if the device has finished the step of these metrics."""
-    return all(array.is_ready() for array in metrics.values())
+    return all(array.is_ready() for array in jax.tree.leaves(metrics))
 
 
 def _skipped_before(state: Any) -> int:

@@ -70,7 +70,10 @@ def labelled_questions(label: Int[np.ndarray, "n A"]) -> tuple[np.ndarray, np.nd
     """
     contact, attribute = np.nonzero(label >= 0)
     if not len(contact):
-        raise NoLabelsError(f"label has {len(label)} rows and none is known (≥ 0): annotate some contacts of this part")
+        raise NoLabelsError(
+            f"label has {len(label)} rows and none is known (≥ 0): label some objects of this part, as with "
+            "`python -m sensors_io label RECORDS --labels LABELS.csv --annotator NAME`"
+        )
     return contact, attribute
 
 

@@ -65,7 +65,8 @@ def train_grpo(
     constraint = policy.constraint if config.algorithm.constrained else None
     levels = None if config.algorithm.enumerated is None else policy.level_tokens
     gather = hooks.devices.gather_params
-    optimizer, step = grpo_program(policy.fns, score, config, loop.steps, constraint, lora, gather, levels)
+    parts = (policy.fns, score, config, loop.steps, constraint, lora, gather, levels)
+    optimizer, step = grpo_program(*parts, sampled=hooks.sampled is not None)
     decoder = {"decoder": params["decoder"]}
     check_whole_batch(policy.fns, decoder, batches, config, hooks, noise, seed)
     trained = decoder if lora is None else fresh_adapters(decoder, {}, lora, seed)
@@ -112,12 +113,13 @@ def grpo_program(
     lora: LoraConfig | None = None,
     gather: Callable[[Params], Params] = lambda params: params,
     levels: LevelTokens | None = None,
+    sampled: bool = False,
 ) -> tuple[optax.GradientTransformation, Any]:
     """Optimizer and compiled step, made once for all seeds; with adapters the frozen decoder is the last argument."""
     learning_rate = config.learning_rate * config.lr_scale
     updates = steps * config.algorithm.updates * config.algorithm.minibatches
     optimizer = falling_adamw(learning_rate, config.final_share, updates, config.max_grad_norm)
-    make = functools.partial(make_grpo_step, gather=gather, levels=levels)
+    make = functools.partial(make_grpo_step, gather=gather, levels=levels, sampled=sampled)
     plain = make(fns, score, optimizer, config, constraint)
     if lora is None:
         return optimizer, plain

@@ -1,4 +1,4 @@
-"""Two runs side by side: figures of hand-made results, and two real runs of the fake experiment."""
+"""Runs side by side: figures of hand-made results, and two real runs of the fake experiment."""
 
 import json
 from pathlib import Path
@@ -61,6 +61,16 @@ def test_requirements_and_cells_of_tables():
     }
 
 
+def test_of_several_runs_shared_figures_are_judged_against_the_first():
+    runs = [{"arms": {"x": {"acc": estimate(*seeds)}}} for seeds in ((1, 2), (1, 2), (3, 4.1))]
+    runs[1]["arms"]["x"]["csc"] = estimate(1)
+    found = {f.where: f for f in compare_results(*runs)}
+    assert (found["x acc"].change, found["x acc"].verdict) == ("C", "0 lies outside")
+    assert len(found["x acc"].shown) == 3
+    assert found["x csc"].verdict == "only in B"
+    assert found["x csc"].shown[::2] == ("–", "–")
+
+
 @pytest.fixture(scope="module")
 def home(tmp_path_factory) -> Path:
     """Two finished runs of the fake experiment, which differ in one setting."""
@@ -86,6 +96,23 @@ def test_two_runs_of_one_experiment(home, capsys):
     assert "Cost: A " in out
 
 
+def test_figures_that_runs_share_come_first(home, capsys):
+    first, second = stamps(home)
+    path = home / "coin" / second / "results.json"
+    text = path.read_text()
+    try:
+        changed = read_json(path)
+        changed["arms"]["other"] = changed["arms"].pop("paid")
+        changed["arms"]["unpaid"]["acc"]["per_seed"][0] += 1
+        write_sealed(path, changed)
+        assert main(["compare", f"coin/{first}", f"coin/{second}", "--runs-dir", str(home)], package=FAKES) == 0
+    finally:
+        path.write_text(text)
+    out = capsys.readouterr().out
+    table = out[out.index("figure  ") :]
+    assert table.index("unpaid acc") < table.index("only in A")
+
+
 def test_the_gravest_differences_come_first_and_the_others_are_counted(home, capsys):
     first, second = (home / "coin" / stamp / "results.json" for stamp in stamps(home))
     text = second.read_text()
@@ -105,7 +132,9 @@ def test_what_cannot_be_compared_is_said(home, tmp_path, capsys):
     assert main(["compare", "coin", "dice", "--runs-dir", str(home)], package=FAKES) == 1
     assert "'dice' is no run" in capsys.readouterr().err
     assert main(["compare", "coin", "coin", "--runs-dir", str(home)], package=FAKES) == 1
-    assert "RUN_A and RUN_B are both" in capsys.readouterr().err
+    assert "is named twice" in capsys.readouterr().err
+    assert main(["compare", "coin", "--runs-dir", str(home)], package=FAKES) == 1
+    assert "must be at least two" in capsys.readouterr().err
     (tmp_path / "config.json").write_text("{")
     assert main(["compare", "coin", str(tmp_path), "--runs-dir", str(home)], package=FAKES) == 1
     assert "DamagedFileError" in capsys.readouterr().err

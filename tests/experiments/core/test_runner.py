@@ -1,5 +1,6 @@
 """The command line end to end: finding, overriding, running, continuing, stopping."""
 
+import dataclasses
 import json
 import os
 import signal
@@ -14,8 +15,9 @@ import pytest
 from experiments.core import runs
 from experiments.core.artifacts import read_json
 from experiments.core.commands import find
-from experiments.core.runner import Experiment, main, parse
+from experiments.core.runner import Experiment, main, parse, run_experiment
 from tests.experiments.fakes import coin
+from touchr1_jax.rl.config import AnyAlgorithm, Dapo, Paper
 
 FAKES = "tests.experiments.fakes"
 ROOT = Path(__file__).resolve().parents[3]
@@ -46,7 +48,9 @@ def directories() -> list[Path]:
         (["coin", "--toss.bia", "3"], 2, "--toss.bias"),
         (["coin", "--scael", "3"], 2, "--scale"),
         (["coin", "--scale", "huge"], 2, "smoke"),
-        (["coin", "--help"], 0, "Chance of heads"),
+        (["coin", "--help"], 0, "Steps of every run"),
+        (["coin", "--help"], 0, "--toss.…  1"),
+        (["coin", "--help-all"], 0, "Chance of heads"),
     ],
 )
 def test_names_are_listed_and_typos_answered_with_the_right_one(capsys, arguments, code, printed):
@@ -130,6 +134,18 @@ def test_another_configuration_or_fresh_starts_anew(monkeypatch):
     assert len(directories()) == 3
 
 
+def test_only_a_run_that_computes_becomes_the_latest(capsys):
+    def refuse(config, context):
+        raise FileNotFoundError("data_dir is 'tyop': must be a folder; correct it")
+
+    assert run("coin", "--steps", "1") == 0
+    latest = Path("runs/coin/latest").resolve()
+    assert run_experiment(dataclasses.replace(coin.EXPERIMENT, run=refuse), [], "about") == 1
+    assert "correct it" in capsys.readouterr().err
+    assert len(directories()) == 2
+    assert Path("runs/coin/latest").resolve() == latest
+
+
 def test_a_run_directory_serves_one_process_at_a_time(monkeypatch, capsys):
     monkeypatch.setenv("COIN_CRASHES", "1")
     with pytest.raises(RuntimeError):
@@ -161,6 +177,44 @@ def test_a_signal_stops_cleanly_and_prints_how_to_continue(workplace, number, co
     assert [json.loads(line)["step"] for line in lines] == list(range(len(lines)))
     assert not (directory / "results.json").exists()
     assert not list(directory.rglob(".*.json.*")), "half-written files were left behind"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Learning:
+    algorithm: AnyAlgorithm = Paper()
+    rate: float = 1.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LearningConfig:
+    seeds: int = 3
+    grpo: Learning = Learning()
+
+
+LEARNING = Experiment(name="learning", config=LearningConfig(), run=coin.run)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ("--grpo.algorithm.beta 0.1", Paper(beta=0.1)),
+        ("--grpo.algorithm.beta 0.1 --seeds 2 --grpo.rate 3", Paper(beta=0.1)),
+        ("--grpo.algorithm.beta 0.1 grpo.algorithm:dapo --seeds 2", Dapo(beta=0.1)),
+        ("--runs-dir host:1 --grpo.algorithm.beta 0.1 --grpo.rate 2 grpo.algorithm:dapo", Dapo(beta=0.1)),
+    ],
+)
+def test_options_of_a_choice_stand_anywhere(arguments, expected):
+    command = parse(LEARNING, arguments.split(), "about")
+    assert command.config.grpo.algorithm == expected
+
+
+def test_help_shows_what_matters_first_and_counts_the_rest(capsys):
+    for flag, most in (("--help", 45), ("--help-all", 1000)):
+        with pytest.raises(SystemExit):
+            parse(LEARNING, [flag], "about")
+        lines = capsys.readouterr().out.splitlines()
+        assert len(lines) <= most
+    assert any("--grpo.algorithm.beta" in line for line in lines)
 
 
 @pytest.mark.parametrize(

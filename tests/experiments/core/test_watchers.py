@@ -5,13 +5,24 @@ import re
 import struct
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 
 from experiments.core.context import Context, MetricLog
+from experiments.core.progress import TrainingSample
 from experiments.core.runner import main
-from experiments.core.watchers import CURVES_SHARE, MOST_PANELS, PAGE_EVERY_S, TENSORBOARD, Events, LivePage
+from experiments.core.watchers import (
+    CURVES_SHARE,
+    MOST_PANELS,
+    PAGE_EVERY_S,
+    SAMPLES,
+    TENSORBOARD,
+    WANDB,
+    Events,
+    LivePage,
+)
 from tests.experiments.core.test_report import DESCRIPTION, HOSTILE, read
 
 FAKES = "tests.experiments.fakes"
@@ -62,6 +73,23 @@ def test_the_page_follows_loops_and_lines_and_ends_with_the_cause(tmp_path, cons
     verdict = read(shown(context)).text.partition("Configuration")[0]
     assert f"by RuntimeError: rolled away {HOSTILE}. To continue: python -m experiments coin" in verdict
     assert "--fresh" not in verdict
+    context.close()
+
+
+def test_the_page_shows_what_the_policy_answers(tmp_path, console):
+    clock = Clock()
+    _, context = watched(tmp_path, console, clock)
+    clock.now += PAGE_EVERY_S
+    for step in range(9):
+        sample = TrainingSample(
+            question="how hard is it?", answer=f"soft {HOSTILE}", truth="hardness soft", reward=0.97
+        )
+        context.sampled("grpo/paid/0", step, sample)
+    with context.progress("grpo", 3, note="compiling the first step"):
+        text = read(shown(context)).text
+    assert "compiling the first step" in text
+    assert f"soft {HOSTILE}hardness soft0.97" in text.replace("\n", "")
+    assert text.count("how hard is it?") == SAMPLES
     context.close()
 
 
@@ -163,3 +191,41 @@ def test_a_run_writes_events_when_asked_and_needs_the_package(tmp_path, monkeypa
     assert main(["coin", "--tensorboard"], package=FAKES) == 2
     assert "pip install 'touchr1-jax[tensorboard]'" in capsys.readouterr().err
     assert sorted(tmp_path.glob("runs/coin/*")) == runs
+
+
+class FakeRun:
+    """A run of Weights & Biases that keeps what it is sent."""
+
+    def __init__(self):
+        self.metrics, self.lines, self.ended = {}, [], 0
+
+    def define_metric(self, name, step_metric):
+        self.metrics[name] = step_metric
+
+    def log(self, values):
+        self.lines.append(values)
+
+    def finish(self):
+        self.ended += 1
+
+
+def test_a_run_sends_its_figures_when_asked_and_goes_on_in_the_same_place(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    orders, sent = [], FakeRun()
+    monkeypatch.setitem(sys.modules, WANDB, SimpleNamespace(init=lambda **order: (orders.append(order), sent)[1]))
+    arguments = ["coin", "--steps", "6", "--seeds", "2", "--crash-at", "5", "--wandb"]
+    monkeypatch.setenv("COIN_CRASHES", "1")
+    with pytest.raises(RuntimeError):
+        main(arguments, package=FAKES)
+    monkeypatch.delenv("COIN_CRASHES")
+    assert main(arguments, package=FAKES) == 0
+    assert orders[0] == orders[1]
+    assert orders[0]["id"] == f"coin-{(tmp_path / 'runs/coin/latest').resolve().name}"
+    assert orders[0]["config"]["steps"] == 6
+    assert sent.metrics["train/unpaid/1/*"] == "train/unpaid/1/step"
+    steps = [line["train/paid/0/step"] for line in sent.lines if "train/paid/0/reward" in line]
+    assert steps == [0, 1, 2, 3, 4, 5]
+    assert sent.ended == 2
+    monkeypatch.setitem(sys.modules, WANDB, None)
+    assert main(arguments, package=FAKES) == 2
+    assert "pip install 'touchr1-jax[wandb]'" in capsys.readouterr().err

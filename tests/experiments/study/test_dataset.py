@@ -46,6 +46,14 @@ def test_an_empty_part_is_refused(tmp_path, contacts, share, part):
         split_parts(store, share)
 
 
+def test_records_without_labels_name_the_command_that_labels(tmp_path):
+    store = RecordStore(fakes.write(tmp_path, contacts=8))
+    for card in store.objects.values():
+        store.objects[card.object_id] = dataclasses.replace(card, labels={})
+    with pytest.raises(ValueError, match=r"none of the .* objects has a label: .* sensors_io label"):
+        split_parts(store, 0.5)
+
+
 def test_the_prior_is_that_of_training_labels_alone(data):
     label = np.array([[0, 2, -1, 8], [0, 1, -1, 8], [1, -1, -1, 0], [2, 2, 0, 1]], np.int32)
     parts = {"sft": np.array([0, 1]), "grpo": np.array([2]), "val": np.array([3]), "test": np.array([3])}

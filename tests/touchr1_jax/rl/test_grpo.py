@@ -14,6 +14,7 @@ from tests.touchr1_jax.rl import reference
 from touchr1_jax.rl.config import GRPOConfig, Paper
 from touchr1_jax.rl.counterfactual import mask_one_stream
 from touchr1_jax.rl.grpo import FrozenInputs, GRPOState, make_grpo_step
+from touchr1_jax.rl.metrics import SAMPLE
 from touchr1_jax.rl.rollout import SampleConfig, sample_group
 from touchr1_jax.types import Parsed, Target
 
@@ -231,9 +232,15 @@ def test_weights_are_gathered_for_the_sampler_and_not_for_the_learner(run):
         gathered.append(jax.tree.structure(params))
         return jax.tree.map(jnp.zeros_like, params)
 
-    _, metrics = make_grpo_step(FNS, score, OPTIMIZER, CONFIG, gather=zeros)(state(), run.batches[0], FROZEN)
+    step = make_grpo_step(FNS, score, OPTIMIZER, CONFIG, gather=zeros, sampled=True)
+    _, metrics = step(state(), run.batches[0], FROZEN)
     assert gathered == [jax.tree.structure(run.before[0].params)]
     assert metrics["grad_norm"] > 0
+    sample, target = metrics[SAMPLE], run.batches[0].target
+    np.testing.assert_array_equal(sample.asked, target.asked[0])
+    np.testing.assert_array_equal(sample.label, target.label[0])
+    expected, _, _ = score(sample.tokens, jax.tree.map(lambda x: x[0], target))
+    np.testing.assert_allclose(sample.reward, expected, rtol=1e-6)
 
 
 def test_lean_compilation_needs_a_jax_that_has_it():

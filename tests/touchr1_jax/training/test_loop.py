@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tests.touchr1_jax.training.stepping import feed, guarded_start, guarded_step, start, step
+from touchr1_jax.rl.metrics import SAMPLE
 from touchr1_jax.training.checkpoint import Checkpoints
 from touchr1_jax.training.loop import HELD_OUT, SKIPPED, Hooks, LoopConfig, LoopTime, NonFiniteGradientError, fetch, fit
 
@@ -121,6 +122,18 @@ def test_a_longer_run_goes_on_from_a_shorter_one(tmp_path):
 def test_without_hooks_it_trains_from_the_beginning(whole):
     for a, b in zip(arrays(fit(step, start(), feed(), CONFIG)), arrays(whole[0]), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_samples_are_passed_on_and_are_no_metrics():
+    def sampling(state, batch):
+        state, metrics = step(state, batch)
+        return state, {**metrics, SAMPLE: jax.numpy.arange(2)}
+
+    seen, lines = [], []
+    hooks = Hooks(log=lambda t, m: lines.append(m), sampled=lambda t, sample: seen.append((t, sample.tolist())))
+    fit(sampling, start(), feed(), LoopConfig(steps=2), hooks)
+    assert seen == [(0, [0, 1]), (1, [0, 1])]
+    assert not any(SAMPLE in line for line in lines)
 
 
 def test_metrics_become_floats():

@@ -1,0 +1,340 @@
+"""A sweep: every combination of some options of one experiment, a run each, in a folder of runs with one page.
+
+    FOLDER/{sweep.json, report.html, plots/, NAME/STAMP/…}
+
+FOLDER is a folder of runs like any other: `list`, `compare` and `ask` take it.  The work is the list of `SweepUnit`s in
+`sweep.json`.  Each is one command that is done when FOLDER holds a finished run of its configuration, so that whoever
+runs them, here one after the other, needs to know nothing else.
+"""
+
+import dataclasses
+import hashlib
+import itertools
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import tyro
+
+from experiments.core import runs
+from experiments.core.artifacts import jsonable, write_sealed
+from experiments.core.charts import Panel, Series, draw, estimates
+from experiments.core.commands import PROG, SWEEP, find, print_error, print_lines, unknown_name
+from experiments.core.compare import figures
+from experiments.core.report import write_report
+from experiments.core.results import Cell, Column, Estimate, Picture, Results, Table
+from experiments.core.runner import Experiment, load, parse, run_experiment
+from sensors_io.errors import UserError
+from touchr1_jax.bench.scoring import REPORTED
+
+FOLDERS = "sweeps"
+"""Folder of the sweeps in the folder of all runs."""
+
+DIGITS = 8
+"""Of a hash in a name."""
+
+MOST = 6
+"""Figures of a table whose figures nobody chose."""
+
+MAIN = ("acc", "avg", "omae")
+"""Metrics of a table of arms whose figures nobody chose."""
+
+WIDE = 20.0
+"""Largest over smallest value from which on an axis is logarithmic."""
+
+NOTE = (
+    "Scores are those of test objects.  They say how much a setting matters; a setting that was chosen by them must be "
+    "scored on other objects."
+)
+
+
+class SweepError(UserError, ValueError):
+    """Options that make no sweep; the message names the option, its value and the fix."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SweepUnit:
+    """One run of a sweep.
+
+    Attributes:
+      digest: hash of scale and configuration, by which the run is found.
+      settings: varied option → value.
+      command: words of the command line after the name of the experiment.
+      home: folder of the runs that it becomes one of.
+      config: in JSON's types.
+    """
+
+    digest: str
+    settings: Mapping[str, str]
+    command: tuple[str, ...]
+    home: Path
+    config: Any
+
+    @property
+    def directory(self) -> Path | None:
+        """Directory of its newest finished run, else of its newest one, else `None`."""
+        return runs.newest(self.home, self.config, finished=True) or runs.newest(self.home, self.config, finished=False)
+
+    @property
+    def run(self) -> runs.PastRun | None:
+        """Its run, if it has begun."""
+        return None if self.directory is None else runs.read_run(self.directory)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SweepCommand:
+    """Run an experiment once for every combination of values, in a folder of runs with one page.
+
+    All further options are those of the experiment.  The same command continues a sweep that was stopped; a finished
+    run is not run again.
+    """
+
+    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
+    """An experiment."""
+    vary: tyro.conf.UseAppendAction[tuple[str, ...]]
+    """An option and its values, as in `--vary grpo.lr-scale=50,100,200`; once for each option that varies."""
+    into: Path | None = None
+    """Folder of the sweep; by default in RUNS_DIR/sweeps, named after the values.  With more values it grows."""
+    figures: tuple[str, ...] = ()
+    """Words in the names of the figures to show, as `compare` names them; by default the main ones."""
+    runs_dir: Path = Path("runs")
+    """Folder of all runs."""
+
+    def run(self, rest: Sequence[str], package: str = "experiments") -> int:
+        """Run the sweep and return the exit status; `rest` are options of the experiment."""
+        entries = find(package)
+        if self.name not in entries:
+            print_error(unknown_name(self.name, entries))
+            return 2
+        experiment, about = load(self.name, package)
+        try:
+            folder, units = plan(experiment, about, self.vary, rest, self.runs_dir, self.into)
+        except ValueError as error:  # also a configuration that refuses its own values
+            print_error(f"{type(error).__name__}: {error}")
+            return 2
+        return run_sweep(experiment, about, folder, units, self.figures)
+
+
+def main(arguments: Sequence[str], package: str = "experiments") -> int:
+    """The command line after `sweep`, for the experiments of a package; returns the exit status."""
+    prog = f"{PROG} {SWEEP}"
+    command, rest = tyro.cli(SweepCommand, args=arguments, prog=prog, return_unknown_args=True)
+    return command.run(rest, package)
+
+
+def options_of(vary: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Option → its values, from words such as `grpo.lr_scale=50,100`; dashes and underscores are the same.
+
+    Raises:
+      SweepError: a word without an option and values, or an option named twice.
+    """
+    found: dict[str, tuple[str, ...]] = {}
+    for word in vary:
+        name, _, values = word.partition("=")
+        name, listed = name.removeprefix("--").replace("_", "-"), tuple(v.strip() for v in values.split(","))
+        if not name or not all(listed):
+            raise SweepError(f"--vary is {word!r}: must be OPTION=VALUE,VALUE, as in grpo.lr-scale=50,100; correct it")
+        if name in found:
+            raise SweepError(f"--vary names {name} twice: give all of its values in one, with commas between them")
+        found[name] = listed
+    if not found:
+        raise SweepError("no option varies: give at least one, as in --vary grpo.lr-scale=50,100")
+    return found
+
+
+def plan(
+    experiment: Experiment[Any], about: str, vary: Sequence[str], rest: Sequence[str], runs_dir: Path, into: Path | None
+) -> tuple[Path, tuple[SweepUnit, ...]]:
+    """The folder of a sweep and its units, in the order of the values, the last option fastest.
+
+    Args:
+      experiment, about: what runs, and its docstring.
+      vary: options and their values, as `options_of` takes them.
+      rest: words of the command line for all runs.
+      runs_dir: folder of all runs.
+      into: the folder; by default named after the units, so that the same sweep goes on in it.
+
+    Raises:
+      SweepError: as `options_of`; an option that a sweep gives itself, or two units of one configuration.
+      SystemExit: code 2 after the correction of an option or a value that the experiment does not know.
+    """
+    own = [word for word in rest if word.partition("=")[0] in ("--fresh", "--runs-dir", "--runs_dir")]
+    if own:
+        raise SweepError(f"{own[0]} belongs to single runs: leave it out; --into names the folder of a sweep")
+    varied, planned = options_of(vary), dict[str, tuple[dict[str, str], tuple[str, ...], Any]]()
+    for values in itertools.product(*varied.values()):
+        settings = dict(zip(varied, values, strict=True))
+        words = (*rest, *itertools.chain(*(_words(*one) for one in settings.items())))
+        command = parse(experiment, words, about)
+        config = jsonable(command.config, where="config")
+        digest = hashlib.sha256(json.dumps([command.scale, config], sort_keys=True).encode()).hexdigest()[:DIGITS]
+        if digest in planned:
+            raise SweepError(f"{planned[digest][0]} and {settings} are one configuration: drop one")
+        planned[digest] = settings, words, config
+    name = f"{experiment.name}-{hashlib.sha256(''.join(sorted(planned)).encode()).hexdigest()[:DIGITS]}"
+    folder = into or runs_dir / FOLDERS / name
+    return folder, tuple(
+        SweepUnit(
+            digest=digest,
+            settings=settings,
+            command=(*words, "--runs-dir", str(folder)),
+            home=folder / experiment.name,
+            config=config,
+        )
+        for digest, (settings, words, config) in planned.items()
+    )
+
+
+def _words(option: str, value: str) -> tuple[str, ...]:
+    """An option and its value as words of a command line; true and false are flags."""
+    if value.lower() not in ("true", "false"):
+        return (f"--{option}", *value.split())
+    group, dot, last = option.rpartition(".")
+    return (f"--{option}" if value.lower() == "true" else f"--{group}{dot}no-{last}",)
+
+
+def run_sweep(
+    experiment: Experiment[Any], about: str, folder: Path, units: Sequence[SweepUnit], wanted: Sequence[str]
+) -> int:
+    """Run what is not finished, write the page after each run, and return the exit status: 1 if a run failed.
+
+    A signal stops the sweep with the status of its run.  `wanted` are parts of the names of the figures to show.
+    """
+    scale = parse(experiment, units[0].command, about).scale
+    listed = [{"hash": u.digest, "settings": u.settings, "command": u.command, "config": u.config} for u in units]
+    folder.mkdir(parents=True, exist_ok=True)
+    write_sealed(folder / "sweep.json", {"experiment": experiment.name, "scale": scale, "units": listed})
+    failed = 0
+    for i, unit in enumerate(units):
+        past, title = unit.run, ", ".join(f"{name} {value}" for name, value in unit.settings.items())
+        if past is not None and past.state == "finished":
+            print_lines(f"{i + 1} of {len(units)}, {title}: finished before, {past.directory}")
+            continue
+        print_lines(f"{i + 1} of {len(units)}, {title}")
+        status = run_experiment(experiment, unit.command, about)
+        jax.clear_caches()  # programs of one configuration; those of all would fill the memory
+        write_page(experiment.name, about, scale, folder, units, wanted)
+        if status > 1:
+            print_lines("To continue the sweep, run the same command again.")
+            return status
+        failed += status
+    print_lines(f"sweep: {write_page(experiment.name, about, scale, folder, units, wanted)}")
+    return int(failed > 0)
+
+
+def write_page(
+    name: str, about: str, scale: str, folder: Path, units: Sequence[SweepUnit], wanted: Sequence[str] = ()
+) -> Path:
+    """Write the page of a sweep: one table, a row for each run, and one chart; the path of the page."""
+    every = [(unit, unit.run) for unit in units]
+    finished = [(unit, run, figures(run.results)) for unit, run in every if run is not None and run.results is not None]
+    chosen = chosen_figures([run.results or {} for _, run, _ in finished], wanted)
+    pictures: tuple[Picture, ...] = ()
+    if chosen and len(finished) > 1:
+        content = chart([(unit.settings, of) for unit, _, of in finished], chosen)
+        title = f"Figures over {next(iter(units[0].settings))}"
+        pictures = (Picture(name="sweep", title=title, caption="Bars: 95 % intervals.", content=content),)
+    results = Results(
+        verdict=(f"{len(finished)} of {len(units)} runs are finished.",),
+        tables=(_table(folder, every, chosen),),
+        pictures=pictures,
+    )
+    varied = {option: list(dict.fromkeys(u.settings[option] for u in units)) for option in units[0].settings}
+    description = {"experiment": f"{name}, a sweep", "scale": scale, "git": dataclasses.asdict(runs.revision())}
+    return write_report(folder, results, about=about, description=description | {"varied": varied})
+
+
+def _table(folder: Path, every: Sequence[tuple[SweepUnit, runs.PastRun | None]], chosen: Sequence[str]) -> Table:
+    columns = [Column(name=option) for option in every[0][0].settings]
+    for figure in chosen:
+        arm, _, metric = figure.rpartition(" ")
+        known = REPORTED.get(metric)
+        named = {"name": figure, "format": ".4g"}
+        if known is not None:
+            named = {"name": f"{arm}: {known.title}", "unit": known.unit, "format": known.format}
+        columns.append(Column(**named))
+    columns += [Column(name="state"), Column(name="time", unit="s", format=",.0f")]
+    columns += [Column(name="run", link="report.html")]
+    rows: list[tuple[Cell, ...]] = []
+    for unit, run in every:
+        found = {} if run is None or run.results is None else figures(run.results)
+        numbers = [_number(found.get(figure)) for figure in chosen]
+        cells = [one.mean if isinstance(one, Estimate) else one for one in numbers]
+        state: tuple[Cell, ...] = ("not begun", None, None)
+        if run is not None:
+            state = (run.state, run.seconds, str(run.directory.relative_to(folder)))
+        rows.append((*unit.settings.values(), *cells, *state))
+    return Table(title="Runs", columns=tuple(columns), rows=tuple(rows), note=NOTE)
+
+
+def chosen_figures(results: Sequence[Mapping[str, Any]], wanted: Sequence[str]) -> list[str]:
+    """Names of numbers that all runs have: with a wanted word in them, else the main ones of the arms, or a few."""
+    numbers = [{n for n, x in figures(one).items() if _number(x) is not None} for one in results]
+    shared = [n for n in (figures(results[0]) if results else ()) if all(n in of for of in numbers)]
+    if wanted:
+        return [n for n in shared if any(word in n for word in wanted)]
+    arms = results[0].get("arms", {}) if results else {}
+    main = [f"{arm} {metric}" for metric in MAIN for arm in arms]
+    return [n for n in main if n in shared] or shared[:MOST]
+
+
+def chart(finished: Sequence[tuple[Mapping[str, str], Mapping[str, Any]]], chosen: Sequence[str]) -> bytes:
+    """Draw a panel for each metric, or each figure without one, over the first option.
+
+    A line is an arm, and an arm for each setting of the further options.
+
+    Args:
+      finished: settings and figures of each run.
+      chosen: names of the figures.
+    """
+    first = next(iter(finished[0][0]))
+    listed = list(dict.fromkeys(settings[first] for settings, _ in finished))
+    places = dict(zip(listed, _numbers(listed) or range(len(listed)), strict=True))
+    positive = _numbers(listed) and min(places.values()) > 0
+    scale: Any = "log" if positive and max(places.values()) >= WIDE * min(places.values()) else "linear"
+    panels: dict[str, dict[str, list[tuple[float, Any]]]] = {}
+    for figure in chosen:
+        arm, _, metric = figure.rpartition(" ")
+        title, line = (_title(metric), arm) if metric in REPORTED else (figure, "")
+        for settings, of in finished:
+            others = ", ".join(f"{name} {value}" for name, value in settings.items() if name != first)
+            named = ", ".join(filter(None, (line, others)))
+            panels.setdefault(title, {}).setdefault(named, []).append((places[settings[first]], _number(of[figure])))
+    ticks = {place: value for value, place in places.items()}
+    return draw(
+        [
+            Panel(list(_lines(lines)), title=title, x_label=first, x_scale=scale, x_ticks=ticks)
+            for title, lines in panels.items()
+        ]
+    )
+
+
+def _lines(lines: Mapping[str, Sequence[tuple[float, Any]]]) -> Iterator[Series]:
+    for name, points in lines.items():
+        at, values = zip(*sorted(points, key=lambda point: point[0]), strict=True)
+        if isinstance(values[0], Estimate):
+            yield estimates(name, values, at=at)
+        else:
+            yield Series(name, x=at, y=values)
+
+
+def _number(value: Any) -> Estimate | float | None:
+    """A figure as a number or an estimate; `None` for what is neither."""
+    if isinstance(value, Mapping):
+        return Estimate(**{**value, "ci95": tuple(value["ci95"]), "per_seed": tuple(value["per_seed"])})
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def _numbers(words: Sequence[str]) -> list[float]:
+    """Words as numbers, nothing where one is none."""
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        return []
+
+
+def _title(metric: str) -> str:
+    unit = REPORTED[metric].unit
+    return f"{REPORTED[metric].title} ({unit})" if unit else REPORTED[metric].title

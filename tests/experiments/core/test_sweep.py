@@ -1,0 +1,128 @@
+"""A sweep is its units: each runs once, what is finished stays, and one page shows them all."""
+
+from pathlib import Path
+
+import pytest
+
+from experiments.core.artifacts import read_json
+from experiments.core.runner import main
+from experiments.core.runs import locate
+from experiments.core.sweep import SweepError, chart, chosen_figures, options_of, plan
+from experiments.core.sweep import main as sweep
+from tests.experiments.core.test_report import read
+from tests.experiments.fakes import coin
+
+FAKES = "tests.experiments.fakes"
+SWEEP = ("coin", "--vary", "toss.bias=0.1,0.9", "--vary", "coin=gold,silver", "--steps", "8", "--seeds", "2")
+
+
+@pytest.fixture
+def workplace(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def directories(folder: Path) -> list[Path]:
+    return sorted(p for p in (folder / "coin").iterdir() if not p.is_symlink())
+
+
+def test_a_stopped_sweep_goes_on_and_runs_nothing_twice(workplace, monkeypatch, capsys):
+    arguments = (*SWEEP, "--crash-at", "6")
+    monkeypatch.setenv("COIN_CRASHES", "1")
+    with pytest.raises(RuntimeError, match="rolled away"):
+        sweep(arguments, package=FAKES)
+    monkeypatch.delenv("COIN_CRASHES")
+    assert sweep(arguments, package=FAKES) == 0
+    assert "continuing runs/sweeps/" in capsys.readouterr().out
+    (folder,) = Path("runs/sweeps").iterdir()
+    made = directories(folder)
+    assert len(made) == 4
+    assert sweep(arguments, package=FAKES) == 0
+    assert capsys.readouterr().out.count("finished before") == 4
+    assert directories(folder) == made
+    assert not Path("runs/coin").exists()
+    units = read_json(folder / "sweep.json")["units"]
+    assert [u["settings"] for u in units] == [
+        {"toss.bias": bias, "coin": metal} for bias in ("0.1", "0.9") for metal in ("gold", "silver")
+    ]
+    configs = [read_json(directory / "config.json")["config"] for directory in made]
+    assert [u["config"] for u in units] == configs
+    page = (folder / "report.html").read_text()
+    assert "4 of 4 runs are finished." in read(page).text
+    assert page.count('/report.html">coin/') == 4
+    assert page.count("<img") == 1
+    shown = read(page).text
+    assert "paid: Acc" in shown
+    assert "unpaid: OMAE" in shown
+
+
+def test_a_sweep_with_more_values_keeps_what_its_folder_holds(workplace, capsys):
+    for values in ("2", "2,3"):
+        arguments = (
+            "coin",
+            "--vary",
+            f"seeds={values}",
+            "--steps",
+            "1",
+            "--into",
+            "mine",
+            "--figures",
+            "omae",
+        )
+        assert sweep(arguments, package=FAKES) == 0
+    out = capsys.readouterr().out
+    assert "1 of 2, seeds 2: finished before" in out
+    assert len(directories(Path("mine"))) == 2
+    text = read(Path("mine/report.html").read_text()).text
+    assert "paid: OMAE" in text
+    assert "paid: Acc" not in text
+    assert main(["compare", *(f"coin/{d.name}" for d in directories(Path("mine"))), "--runs-dir", "mine"], FAKES) == 0
+    assert locate("coin", Path("mine")) == directories(Path("mine"))[-1].resolve()
+
+
+@pytest.mark.parametrize(
+    ("vary", "rest", "what"),
+    [
+        (["steps"], [], "must be OPTION=VALUE"),
+        (["steps=3,"], [], "must be OPTION=VALUE"),
+        (["steps=3", "steps=4"], [], "twice"),
+        ([], [], "no option varies"),
+        (["steps=3,03"], [], "are one configuration"),
+        (["steps=3"], ["--fresh"], "--fresh belongs to single runs"),
+    ],
+)
+def test_options_that_make_no_sweep_are_named(vary, rest, what):
+    with pytest.raises(SweepError, match=what):
+        plan(coin.EXPERIMENT, "about", vary, rest, Path("runs"), None)
+
+
+def test_a_mistyped_option_or_value_runs_nothing(workplace, capsys):
+    for vary, corrected in (("stepz=1,2", "--steps"), ("steps=1,x", "invalid|could not convert")):
+        with pytest.raises(SystemExit) as stop:
+            sweep(["coin", "--vary", vary], package=FAKES)
+        assert stop.value.code == 2
+        assert any(word in capsys.readouterr().err for word in corrected.split("|"))
+    assert sweep(["coyn", "--vary", "steps=1"], package=FAKES) == 2
+    assert "Did you mean coin?" in capsys.readouterr().err
+    assert not list(workplace.iterdir())
+
+
+def test_flags_words_and_pairs_vary():
+    assert options_of(["--grpo.lr_scale=50, 100"]) == {"grpo.lr-scale": ("50", "100")}
+    _, units = plan(coin.EXPERIMENT, "about", ["coin=gold,silver", "toss.bias=.5"], ["--steps=2"], Path("r"), None)
+    assert [u.command[:4] for u in units] == [("--steps=2", "--coin", m, "--toss.bias") for m in ("gold", "silver")]
+
+
+def estimate(mean: float) -> dict:
+    return {"mean": mean, "ci95": [mean - 1, mean + 1], "per_seed": [mean]}
+
+
+def test_figures_that_all_runs_have_are_chosen_and_drawn():
+    study = {"arms": {"x": {"acc": estimate(1), "omae": estimate(2), "csc": estimate(3)}}}
+    assert chosen_figures([study, {"arms": {"x": {"acc": estimate(4)}}}], ()) == ["x acc"]
+    assert chosen_figures([study, study], ("csc",)) == ["x csc"]
+    measured = {"requirements": [{"name": "speed", "measured": 2.0}], "tables": []}
+    assert chosen_figures([measured], ()) == ["requirement: speed"]
+    finished = [({"a": v}, {"x acc": estimate(1), "requirement: speed": 2.0}) for v in ("1", "100")]
+    assert chart(finished, ["x acc", "requirement: speed"]).startswith(b"<?xml")
+    assert chart([({"a": v}, of) for v, (_, of) in zip(("one", "two"), finished, strict=True)], ["x acc"])
