@@ -2,6 +2,7 @@
 
 import dataclasses
 import pathlib
+import shlex
 from typing import Annotated
 
 import tyro
@@ -18,8 +19,10 @@ from sensors_io.importers.tac3d import list_tac3d
 from sensors_io.importers.tacquad import list_tacquad
 from sensors_io.importers.touch_and_go import list_touch_and_go
 from sensors_io.importers.tvl import list_tvl
+from sensors_io.importers.videos import VideosConfig, list_videos
 from sensors_io.importers.vtv150k import VTVConfig, list_vtv150k
 from sensors_io.importers.ycb_slide import list_ycb_slide
+from sensors_io.schema import SPLITS
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -27,7 +30,7 @@ class _Paths:
     """From where to where."""
 
     source: tyro.conf.Positional[pathlib.Path]
-    """Directory of the data set as it is published."""
+    """Directory of the data set as it is published, or of your clips."""
     out: pathlib.Path
     """Directory of the records."""
 
@@ -132,8 +135,19 @@ class EstimateModulus(_Paths):
         return list_estimate_modulus(self.source, self.config)
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Videos(_Paths):
+    """Your own clips of one sensor: videos, or folders of pictures, and a table of labels."""
+
+    config: VideosConfig
+
+    def catalogue(self) -> Catalogue:
+        return list_videos(self.source, self.config)
+
+
 DataSet = (
-    Annotated[Physiclear, tyro.conf.subcommand("physiclear")]
+    Annotated[Videos, tyro.conf.subcommand("videos")]
+    | Annotated[Physiclear, tyro.conf.subcommand("physiclear")]
     | Annotated[Octopi, tyro.conf.subcommand("octopi")]
     | Annotated[TouchAndGo, tyro.conf.subcommand("touch-and-go")]
     | Annotated[Tvl, tyro.conf.subcommand("tvl")]
@@ -148,7 +162,7 @@ DataSet = (
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Import:
-    """Import published recordings.  An interrupted import resumes."""
+    """Import published recordings, or your own.  An interrupted import resumes."""
 
     dataset: DataSet
 
@@ -157,4 +171,9 @@ class Import:
         with progress_bar("contacts") as progress:
             report = import_catalogue(catalogue, self.dataset.out, progress=progress)
         OUT.print(overview.import_table(report))
+        if any(report.objects[split] for split in SPLITS if split != "unlabelled"):
+            train = (
+                f"python -m experiments ablation_ordinal --data records --data-dir {shlex.quote(str(self.dataset.out))}"
+            )
+            OUT.print(f"to train on them: {train}", markup=False, highlight=False, soft_wrap=True)
         return 0

@@ -1,0 +1,98 @@
+"""Somebody's own clips become records with the labels of their table; what does not fit is named by file and line."""
+
+import pytest
+
+from sensors_io.__main__ import main
+from sensors_io.importers.label_table import LabelsError
+from sensors_io.importers.videos import VideosConfig, list_videos
+from sensors_io.records import RecordStore
+from sensors_io.schema import MATERIALS
+from tests.sensors_io.importers.films import film, imported, picture
+
+TABLE = """clip,object_id,hardness,roughness,material,split
+mug/1.avi,mug,2,0,glass,
+mug/2,mug,2,0,glass,
+sponge,sponge,0,,other,
+towel_7.avi,towel,0,2,fabric,
+cube.avi,,1,1,,train
+"""
+
+
+@pytest.fixture
+def clips(tmp_path):
+    """Five clips of four objects, and one that the table does not name."""
+    root = tmp_path / "clips"
+    (root / "mug").mkdir(parents=True)
+    for name in ("mug/1.avi", "mug/2.avi", "towel_7.avi", "cube.avi", "other.avi"):
+        film(root / name, frames=6)
+    for n in (9, 10, 11):
+        picture(root / "sponge" / f"frame_{n}.png", level=10 * n)
+    (root / "notes.txt").write_text("no clip")
+    return root
+
+
+def listed(clips, table=TABLE, **options):
+    labels = clips.parent / "labels.csv"
+    labels.write_text(table)
+    return list_videos(clips, VideosConfig(sensor="gelsight_mini", labels=labels, **options))
+
+
+def test_clips_become_records_with_the_labels_of_their_table(clips, tmp_path):
+    report, store = imported(listed(clips, annotator="me"), tmp_path / "records")
+    assert {(k.object_id, k.trial) for k in store.contacts} == {
+        ("mug", 0), ("mug", 1), ("sponge", 0), ("towel", 0), ("cube", 0),
+    }  # fmt: skip
+    assert store.objects["mug"].labels == {"hardness": 2, "roughness": 0, "material": MATERIALS.index("glass")}
+    assert store.objects["sponge"].labels == {"hardness": 0, "material": MATERIALS.index("other")}
+    assert (store.objects["cube"].split, store.objects["cube"].annotator) == ("train", "me")
+    assert sorted(store.objects[name].split for name in ("mug", "sponge", "towel")) == ["test", "train", "val"]
+    assert [skip.name for skip in report.skipped] == ["other.avi"]
+    at = next(i for i, key in enumerate(store.contacts) if key.object_id == "sponge")
+    frames = store.contact(at)["gelsight_mini"].frames
+    assert [int(frame[-1, -1, 0]) for frame in frames] == [90, 100, 110]
+
+
+def test_without_a_table_every_clip_is_an_unlabelled_object(clips, tmp_path):
+    catalogue = list_videos(clips, VideosConfig(sensor="digit"))
+    assert set(catalogue.cards) == {"mug_1", "mug_2", "sponge", "towel_7", "cube", "other"}
+    assert {card.split for card in catalogue.cards.values()} == {"unlabelled"}
+
+
+def test_a_folder_of_pictures_alone_is_a_clip(tmp_path):
+    for n in range(3):
+        picture(tmp_path / "press" / f"{n}.png")
+    _, store = imported(list_videos(tmp_path / "press", VideosConfig(sensor="digit")), tmp_path / "records")
+    assert [key.object_id for key in store.contacts] == ["press"]
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ("nowhere,x,1,,,", r"line 7: clip is 'nowhere': is no clip of .*give its path in the folder, such as"),
+        ("other,x,3,,,", r"line 7: hardness of 'x' is '3': must be one of 0, 1, 2 \(from soft upwards\)"),
+        ("other,x,,,stone,", r"line 7: material of 'x' is 'stone': must be one of plastic"),
+        ("other,x,,,,dev", r"line 7: split of 'x' is 'dev': must be one of train"),
+        ("other,mug,1,0,glass,", r"line 7: 'mug' has hardness 1, .*an earlier line hardness 2, .*correct one"),
+        ("other,a b,1,,,", r"line 7: .*object_id"),
+        ("other,x", r"line 7: must have 6 cells; complete it"),
+        ("mug/1.avi,x,,,,", r"line 7: clip 'mug/1.avi' appears twice"),
+    ],
+)
+def test_what_does_not_fit_is_named_by_file_and_line(clips, row, said):
+    with pytest.raises(LabelsError, match=rf"labels\.csv, {said}"):
+        listed(clips, f"{TABLE}{row}\n")
+
+
+def test_a_column_that_is_unknown_is_named(clips):
+    with pytest.raises(LabelsError, match=r"columns are .*must be clip and any of"):
+        listed(clips, "clip,softness\nother,1\n")
+
+
+def test_the_command_names_the_one_that_trains(clips, tmp_path, capsys):
+    (tmp_path / "labels.csv").write_text(TABLE)
+    arguments = ["import", "videos", str(clips), "--labels", str(tmp_path / "labels.csv"), "--sensor", "gelsight_mini"]
+    assert main([*arguments, "--out", str(tmp_path / "records")]) == 0
+    assert len(RecordStore(tmp_path / "records")) == 5
+    out = capsys.readouterr().out
+    assert f"python -m experiments ablation_ordinal --data records --data-dir {tmp_path / 'records'}" in out
+    assert "is not listed in" in out
