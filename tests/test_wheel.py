@@ -10,26 +10,37 @@ from pathlib import Path
 
 import pytest
 
+import touchr1_jax
+
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("touchr1_jax", "sensors_io", "experiments")
 ANSWER = "<perceive> xense soft </perceive> <compare> soft </compare> <conclude> soft </conclude>"
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(importlib.util.find_spec("build") is None, reason="needs `pip install build`, and the network"),
+    pytest.mark.skipif(
+        any(importlib.util.find_spec(name) is None for name in ("build", "twine")),
+        reason="needs `pip install -e '.[release]'`, and the network",
+    ),
 ]
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory) -> Path:
-    """Built from a copy, since setuptools leaves files beside the sources."""
+def built(tmp_path_factory) -> Path:
+    """Folder of wheel and sdist, built from a copy, since setuptools leaves files beside the sources."""
     folder = tmp_path_factory.mktemp("sources")
     for package in PACKAGES:
         shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
+    for name in ("pyproject.toml", "README.md", "LICENSE", "MANIFEST.in"):
         shutil.copy(ROOT / name, folder)
-    subprocess.run([sys.executable, "-m", "build", "--wheel", str(folder)], check=True, capture_output=True)
-    (path,) = (folder / "dist").glob("*.whl")
+    subprocess.run([sys.executable, "-m", "build", str(folder)], check=True, capture_output=True)
+    return folder / "dist"
+
+
+@pytest.fixture(scope="module")
+def wheel(built) -> Path:
+    """The wheel, which `build` makes from the sdist."""
+    (path,) = built.glob("*.whl")
     return path
 
 
@@ -54,6 +65,22 @@ def test_every_source_is_there_and_nothing_else(wheel):
     shipped = ("*.py", "py.typed", "*.jinja", "policies/*/*")
     paths = [path for package in PACKAGES for pattern in shipped for path in (ROOT / package).rglob(pattern)]
     assert held == {path.relative_to(ROOT).as_posix() for path in paths}
+
+
+def test_both_are_ready_for_an_index(built):
+    paths = sorted(map(str, built.iterdir()))
+    assert [Path(path).suffix for path in paths] == [".whl", ".gz"]
+    command = [sys.executable, "-m", "twine", "check", "--strict", *paths]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+def test_the_policy_of_the_package_loads_in_an_empty_folder(installed, tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(installed), "JAX_PLATFORMS": "cpu"}
+    code = "import touchr1_jax as t; print(t.__file__, t.__version__, t.load_policy().name)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.stdout.split()[0].startswith(str(installed)), done.stderr
+    assert done.stdout.split()[1:] == [touchr1_jax.__version__, "touch-small"]
 
 
 def test_an_experiment_runs_in_an_empty_folder(installed, tmp_path):

@@ -112,7 +112,8 @@ def markdown(found: tuple[ClaimOutcome, ...]) -> str:
         f"{summary(found)} {SCOPE}",
         "",
         "`python -m experiments show EXPERIMENT` renders the run behind a row as its report; "
-        "`make experiment EXP=EXPERIMENT` measures it again.",
+        "`make experiment EXP=EXPERIMENT` measures it again. The [glossary](../docs/GLOSSARY.md) explains OMAE, CSC "
+        "and Avg.",
         "",
         f"![Changes here and in the paper](figures/{FIGURE.name})",
         "",
