@@ -39,7 +39,7 @@ class CalibrateConfig:
 
     least_presses: int = 8
     folds: int = 5
-    repeats: int = 6
+    repeats: int = 8
     most_misfit: float = 0.7
     most_saturated: float = 0.5
     most_drift: float = 40.0

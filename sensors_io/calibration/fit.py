@@ -12,6 +12,8 @@ every press are kept apart, so that leaving presses out costs a subtraction and 
 """
 
 import dataclasses
+import functools
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from scipy import linalg
@@ -82,11 +84,14 @@ class Gram:
             weight=self.weight - part.weight,
         )
 
-    def solution(self, ridge: float) -> np.ndarray:
-        """Constants [K, 2] under a prior of this strength."""
-        prior = np.diag(ridge * self.weight * _penalties())
-        solved: np.ndarray = linalg.solve(self.normal + prior, self.right, assume_a="pos", check_finite=False)
-        return solved
+    def solutions(self, ridges: Sequence[float]) -> Iterator[np.ndarray]:
+        """Constants [K, 2] under a prior of each strength: one eigendecomposition serves them all."""
+        scale = 1 / np.sqrt(_penalties())
+        values, vectors = linalg.eigh(scale[:, None] * self.normal * scale, check_finite=False, driver="evd")
+        basis = scale[:, None] * vectors
+        right = basis.T @ self.right
+        for ridge in ridges:
+            yield basis @ (right / (np.maximum(values, 0) + ridge * self.weight)[:, None])
 
     def error(self, weights: np.ndarray) -> float:
         """Root mean square error of the normal, √((nᵀWn − 2 wᵀAᵀWn + wᵀAᵀWA w) / Σ W)."""
@@ -148,7 +153,7 @@ def solve_map(
         for k in range(min(folds, len(grams))):
             out = Gram.total([grams[i] for i in order[k::folds]])
             rest = total.without(out)
-            errors.append([out.error(rest.solution(ridge)) for ridge in RIDGES])
+            errors.append([out.error(weights) for weights in rest.solutions(RIDGES)])
     mean = np.mean(errors, 0)
     best = int(mean.argmin())
     by_repeat = np.reshape([row[best] for row in errors], (repeats, -1)).mean(1)
@@ -156,7 +161,8 @@ def solve_map(
         ridge=RIDGES[best], error=float(mean[best]), error_range=(float(by_repeat.min()), float(by_repeat.max()))
     )
     shape = (len(position_terms(POSITION_DEGREE)), len(colour_terms(DEGREE)), 2)
-    weights = total.solution(chosen.ridge).reshape(shape).astype(np.float32)
+    (weights,) = total.solutions((chosen.ridge,))
+    weights = weights.reshape(shape).astype(np.float32)
     return ColourMap(weights=weights, degree=DEGREE, position_degree=POSITION_DEGREE), chosen
 
 
@@ -221,6 +227,7 @@ def _design(position: np.ndarray, colour: np.ndarray) -> np.ndarray:
     return (position[:, None] * colour[None]).reshape(-1, position.shape[-1]).T
 
 
+@functools.cache
 def _penalties() -> np.ndarray:
     """exp(deg P_j + deg ψ_k − 1) of every product, [J·K]."""
     of_position = np.array([sum(term) for term in position_terms(POSITION_DEGREE)])

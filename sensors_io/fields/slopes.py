@@ -61,7 +61,7 @@ class SlopeReader:
         height, width = background.shape[:2]
         places = legendre(height, width, colours.position_degree)
         self._terms = colour_terms(colours.degree)
-        self._maps = np.einsum("jyx,jkc->ckyx", places, colours.weights).astype(np.float32)
+        self._maps = np.einsum("jyx,jkc->ckyx", places, colours.weights, optimize=True).astype(np.float32)
 
     def __call__(self, picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """∂z/∂x and ∂z/∂y, float32 [H, W] each, of one picture, uint8 [H, W, 3] RGB."""

@@ -21,24 +21,27 @@ _LEAST_ARROW_PX = 1.5  # shorter ones are left out: a field of noise stays empty
 _BARB = 0.25  # of an arrow's length, back and to the side
 _SUBPIXEL_BITS = 4  # of coordinates that OpenCV draws by
 _INK, _HALO = (255, 255, 255), (20, 23, 26)
+_RULES_MM = (1.0, 2.0, 5.0, 10.0)  # lengths of the scale; the longest that is a third of the picture at most
+_FONT, _FONT_SCALE, _DRAWN_PX = cv2.FONT_HERSHEY_SIMPLEX, 0.42, 320  # of numbers on a picture of this width
 
 
-def panels(sample: Sample) -> dict[str, Panel]:
-    """Panels of a sample, by name."""
+def panels(sample: Sample, mm_per_px: float | None = None) -> dict[str, Panel]:
+    """Panels of a sample, by name; the pitch of its picture, mm/px, where it is known, gives them a scale."""
     arrays, frame = sample.arrays, sample.frame
+    mm = None if frame is None or mm_per_px is None else frame.shape[1] * mm_per_px
     shown: dict[str, Panel] = {}
     if frame is not None and frame.ndim == 3:
         mask = arrays.get("contact")
-        shown["camera"] = (lambda: frame) if mask is None else functools.partial(outlined, frame, mask)
+        shown["camera"] = lambda: with_rule(frame if mask is None else outlined(frame, mask), mm)
     elif frame is not None:
         shown["camera"] = lambda: coloured(frame, float(frame.max()))
     if "view_depth_mm" in arrays:
         shown["distance"] = lambda: coloured(arrays["view_depth_mm"], float(arrays["view_depth_mm"].max()))
     for name, array in arrays.items():
         if name == "depth_mm" and array.ndim == 2:
-            shown["depth"] = functools.partial(coloured, array, _DEPTH_TOP_MM)
+            shown["depth"] = functools.partial(_drawn, coloured, array, _DEPTH_TOP_MM, mm)
         elif name in ("deformation_mm", "shear_mm") and array.ndim == 3:
-            shown[name.removesuffix("_mm")] = functools.partial(arrows, array)
+            shown[name.removesuffix("_mm")] = functools.partial(_drawn, arrows, array, _SHIFT_TOP_MM, mm)
     return shown
 
 
@@ -66,9 +69,9 @@ def coloured(field: np.ndarray, top: float) -> np.ndarray:
     return _enlarged(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
 
 
-def arrows(field_mm: np.ndarray) -> np.ndarray:
-    """A vector field [h, w, 2] as arrows over its magnitude."""
-    picture = coloured(np.linalg.norm(field_mm, axis=-1), _SHIFT_TOP_MM)
+def arrows(field_mm: np.ndarray, top_mm: float = _SHIFT_TOP_MM) -> np.ndarray:
+    """A vector field [h, w, 2] as arrows over its magnitude, from 0 to `top_mm`."""
+    picture = coloured(np.linalg.norm(field_mm, axis=-1), top_mm)
     height, width = field_mm.shape[:2]
     step = max(1, max(height, width) // _ARROWS)
     rows, columns = np.mgrid[step // 2 : height : step, step // 2 : width : step]
@@ -79,6 +82,46 @@ def arrows(field_mm: np.ndarray) -> np.ndarray:
     strokes = _strokes(start[seen], shift[seen])
     for colour, thickness in ((_HALO, 3), (_INK, 1)):  # white in a dark halo is seen on every colour
         cv2.polylines(picture, strokes, False, colour, thickness, cv2.LINE_AA, _SUBPIXEL_BITS)
+    return picture
+
+
+def with_rule(picture: np.ndarray, width_mm: float | None) -> np.ndarray:
+    """The picture, enlarged if it is small, with a scale in millimetres; as it is where its width is not known."""
+    if width_mm is None:
+        return picture
+    picture = _enlarged(picture)
+    length_mm = max((mm for mm in _RULES_MM if 3 * mm <= width_mm), default=_RULES_MM[0])
+    unit, height = picture.shape[1] / _DRAWN_PX, picture.shape[0]
+    left, low = round(8 * unit), height - round(8 * unit)
+    ends = (left, low), (left + round(length_mm / width_mm * picture.shape[1]), low)
+    for colour, width in ((_HALO, 4 * unit), (_INK, 2 * unit)):
+        cv2.line(picture, *ends, colour, round(width))
+    return _written(picture, f"{length_mm:g} mm", (left, low - round(7 * unit)))
+
+
+def with_bar(picture: np.ndarray, top_mm: float) -> np.ndarray:
+    """The picture beside the colours from 0 to `top_mm`, with both numbers."""
+    height, unit = picture.shape[0], picture.shape[1] / _DRAWN_PX
+    bar = np.full((height, round(64 * unit), 3), _HALO, np.uint8)
+    colours = coloured(np.linspace(np.full(_LEAST_SIDE, top_mm), 0, height), top_mm)
+    bar[:, round(6 * unit) : round(18 * unit)] = colours[:, :1]
+    _written(bar, f"{top_mm:g} mm", (round(21 * unit), round(14 * unit)))
+    _written(bar, "0", (round(21 * unit), height - round(5 * unit)))
+    return np.hstack([picture, bar])
+
+
+def _drawn(
+    draw: Callable[[np.ndarray, float], np.ndarray], field: np.ndarray, top_mm: float, width_mm: float | None
+) -> np.ndarray:
+    """A field with its colours and, where the width of its picture is known, its scale."""
+    return with_bar(with_rule(draw(field, top_mm), width_mm), top_mm)
+
+
+def _written(picture: np.ndarray, words: str, at: tuple[int, int]) -> np.ndarray:
+    """The picture with words, white in a dark halo, in place."""
+    unit = picture.shape[0] / (0.75 * _DRAWN_PX)
+    for colour, width in ((_HALO, 3), (_INK, 1)):
+        cv2.putText(picture, words, at, _FONT, _FONT_SCALE * unit, colour, round(width * unit), cv2.LINE_AA)
     return picture
 
 

@@ -62,6 +62,11 @@ class Channel:
         """Of the sensor."""
         return self.device.identity.sensor
 
+    @property
+    def mm_per_px(self) -> float | None:
+        """Pitch of its pictures, where extractor or device know it."""
+        return self._extractor.mm_per_px if self._extractor is not None else self.device.identity.mm_per_px
+
     def look(self) -> bool:
         """Take the newest sample, with fields; whether it is a new one."""
         self._arrivals.append((time.monotonic(), self.device.counts.arrived))
@@ -186,7 +191,7 @@ class Presenter:
             self._label(channel, name): panel
             for channel in self._channels
             if channel.sample is not None
-            for name, panel in panels(channel.sample).items()
+            for name, panel in panels(channel.sample, channel.mm_per_px).items()
         }
 
     def _captions(self) -> dict[str, str]:

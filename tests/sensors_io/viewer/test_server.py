@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from sensors_io.devices.base import Sample
-from sensors_io.viewer.panels import arrows, coloured, panels
+from sensors_io.viewer.panels import arrows, coloured, panels, with_bar, with_rule
 from sensors_io.viewer.server import LiveView, Numbers
 from tests.sensors_io.checks import refused
 
@@ -111,6 +111,20 @@ def test_fields_are_coloured_and_holes_are_black():
     assert still.shape[:2] == (320, 240)
     assert np.ptp(still.reshape(-1, 3), axis=0).max() == 0  # no arrow where nothing moves
     assert (arrows(np.full((40, 30, 2), 0.2)) == 255).all(-1).any()
+
+
+def test_a_picture_of_known_width_has_a_scale_and_a_field_its_colours():
+    rule = with_rule(np.full((240, 320, 3), 90, np.uint8), 20.0)
+    assert (rule[232] == 255).all(-1).sum() == pytest.approx(5 / 20 * 320, abs=4)  # 5 mm of 20
+    dark = np.zeros((80, 106, 3), np.uint8)
+    assert with_rule(dark, None) is dark
+    for shape in ((240, 320), (400, 300)):
+        bar = with_bar(coloured(np.zeros(shape), 1.5), 1.5)[:, shape[1] + round(10 * shape[1] / 320)]
+        assert bar[0].tolist() == coloured(np.full((1, 1), 2.0), 1.5)[0, 0].tolist()
+        assert bar[-1].tolist() == coloured(np.zeros((1, 1)), 1.5)[0, 0].tolist()
+    frame = np.full((60, 80, 3), 90, np.uint8)
+    sample = Sample(host_time_ns=0, frame=frame, arrays={"depth_mm": np.zeros((60, 80))})
+    assert panels(sample, 0.2)["depth"]().shape[1] > panels(sample, 0.2)["camera"]().shape[1] == 320
 
 
 def requested(view, path="/", **headers):
