@@ -211,8 +211,9 @@ def _check_colours(presses: BallPresses, config: CalibrateConfig) -> None:
         raise CalibrationError(
             f"the colours of the presses change alike: their second component is {second / first:.2f} of the first, "
             f"must be ≥ {config.least_colours:g}; slopes need lamps of several colours from several sides. A sensor of "
-            "one light shows depth as darkness: read it by its maker's table from grey level to depth; here `extract` "
-            "gives its contacts without a calibration, and its shear where the gel has markers"
+            "one light shows depth as darkness: read it by its maker's table from grey level to depth, or by one from "
+            "a press of a ball, as sensors_io/README.md says; here `extract` gives its contacts without a calibration, "
+            "and its shear where the gel has markers"
         )
 
 
