@@ -1,14 +1,18 @@
 """Frames of a video file, read whole or not at all."""
 
+import contextlib
 import dataclasses
 import math
 import pathlib
+from collections.abc import Iterator
 from typing import Any
 
 import cv2
 import numpy as np
 
 from sensors_io.importers.keep import Keep, UnreadableError
+
+_MOST_STATED = 10**6  # frames that a header is believed
 
 
 class VideoError(UnreadableError):
@@ -48,37 +52,48 @@ def read_video(path: pathlib.Path, keep: Keep) -> VideoFrames:
     Raises:
       VideoError: it does not open, states no frame rate, holds no frame, or fewer frames than it states.
     """
-    capture = cv2.VideoCapture(str(path))
-    try:
-        if not capture.isOpened():
-            raise VideoError("does not open as a video")
+    with _opened(path) as capture:
         rate_hz, stated = capture.get(cv2.CAP_PROP_FPS), int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         if not (math.isfinite(rate_hz) and rate_hz > 0):
             raise VideoError(f"states a frame rate of {rate_hz}")
-        frames, size_px = _decode(capture, keep)
-    finally:
-        capture.release()
-    total = len(frames)
+        expected = min(max(stated, 0), _MOST_STATED)
+        frames, total, size_px = _decode(capture, keep, keep.positions(expected))
     if not total:
         raise VideoError("holds no frame that can be decoded")
     if total < stated:
         raise VideoError(f"is cut off: {total} of {stated} frames can be decoded")
     kept = keep.positions(total)
-    images = np.stack([image for n in kept if (image := frames[n]) is not None])
+    if total > expected:  # it states too few, so that others than these were kept
+        with _opened(path) as capture:
+            frames, total, size_px = _decode(capture, keep, kept)
+    images = np.stack([frames[n] for n in kept.tolist()])
     return VideoFrames(frames=images, index=kept, rate_hz=rate_hz, size_px=size_px, total=total)
 
 
-def _decode(capture: cv2.VideoCapture, keep: Keep) -> tuple[list[np.ndarray | None], tuple[int, int]]:
-    """All frames of an open video, `None` between the strides, and their size in the file."""
-    frames: list[np.ndarray | None] = []
-    size_px = (0, 0)
+@contextlib.contextmanager
+def _opened(path: pathlib.Path) -> Iterator[cv2.VideoCapture]:
+    capture = cv2.VideoCapture(str(path))
+    try:
+        if not capture.isOpened():
+            raise VideoError("does not open as a video")
+        yield capture
+    finally:
+        capture.release()
+
+
+def _decode(
+    capture: cv2.VideoCapture, keep: Keep, kept: np.ndarray
+) -> tuple[dict[int, np.ndarray], int, tuple[int, int]]:
+    """Frames at some positions of an open video, of which all others are decoded and dropped; their number and size."""
+    frames: dict[int, np.ndarray] = {}
+    wanted, total, size_px = set(kept.tolist()), 0, (0, 0)
     while capture.grab():
-        if len(frames) % keep.stride:
-            frames.append(None)
-            continue
-        ok, image = capture.retrieve()
-        if not ok:
-            break
-        size_px = image.shape[:2]
-        frames.append(cv2.cvtColor(keep.shrink(image), cv2.COLOR_BGR2RGB))
-    return frames, size_px
+        if total % keep.stride == 0:
+            ok, image = capture.retrieve()
+            if not ok:
+                break
+            size_px = image.shape[:2]
+            if total in wanted:
+                frames[total] = cv2.cvtColor(keep.shrink(image), cv2.COLOR_BGR2RGB)
+        total += 1
+    return frames, total, size_px

@@ -1,5 +1,7 @@
 """Videos are read whole or refused by name."""
 
+import tracemalloc
+
 import cv2
 import numpy as np
 import pytest
@@ -87,3 +89,14 @@ def test_what_the_container_states_is_checked(tmp_path, monkeypatch, stated, mes
 
     monkeypatch.setattr(cv2, "VideoCapture", Capture)
     refused(VideoError, message, lambda: read_video(tmp_path / "a.avi", Keep(**WHOLE)))
+
+
+def test_a_long_video_takes_the_memory_of_the_frames_that_are_kept(tmp_path):
+    """600 frames of 58 kB, of which 32 are kept."""
+    film(tmp_path / "a.avi", 600, size=(120, 160))
+    tracemalloc.start()
+    video = read_video(tmp_path / "a.avi", Keep())
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert (len(video.frames), video.total, video.index[-1]) == (32, 600, 599)
+    assert peak < 3 * video.frames.nbytes
