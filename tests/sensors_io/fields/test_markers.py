@@ -55,10 +55,24 @@ def test_inside_leaves_a_margin():
         (gels.dots(gels.lattice(), contrast=8.0), Pattern.BARE),
         (gels.dots(gels.lattice()[:5]), Pattern.BARE),
         (gels.dots(gels.lattice()[(gels.lattice() < 100).all(1)]), Pattern.BARE),
+        (gels.dots(gels.lattice()[gels.lattice()[:, 0] < 105]), Pattern.BARE),
         (np.where(np.arange(200) < 180, gels.speckle(), 128), Pattern.DENSE),
+        (np.where(np.arange(200) < 170, gels.speckle(), 128), Pattern.DENSE),
         (np.where(np.arange(200) < 140, gels.speckle(), 128), Pattern.BARE),
     ],
-    ids=["dots", "speckle", "skin", "under a load", "faint dots", "few dots", "dots in a corner", "90 %", "70 %"],
+    ids=[
+        "dots",
+        "speckle",
+        "skin",
+        "loaded",
+        "faint dots",
+        "few dots",
+        "dots in a corner",
+        "half",
+        "90 %",
+        "85 %",
+        "70 %",
+    ],
 )
 def test_gels_are_told_apart(picture, pattern):
     """A dense pattern fills nine windows in ten."""
