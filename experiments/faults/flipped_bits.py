@@ -191,7 +191,10 @@ def _program(path: Path) -> str:
 
 READERS: tuple[tuple[str, Callable[[Path], str]], ...] = (
     (r"\.orbax-checkpoint-tmp/", lambda path: ""),  # a save that was cut off: no session looks into it
-    (r"/(_CHECKPOINT_METADATA|commit_success\.txt)$", lambda path: ""),  # times, and a mark that is only looked for
+    (
+        r"/checkpoints/.*/\d+/(_CHECKPOINT_METADATA|commit_success\.txt)$",
+        lambda path: "",
+    ),  # times, and a mark that is only looked for
     (r"/checkpoints/.*/\d+/", _checkpoint),
     (r"/metrics\.jsonl$", _log),
     (r"/answers/[^/]*\.npz$", _answers),
