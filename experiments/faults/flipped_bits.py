@@ -110,8 +110,9 @@ def go_on_flipped(
             path.unlink(missing_ok=True)
         damaged = {home / one.path: (home / one.path).read_bytes() for one in group}
         code, output = Session(training, home, programs).end()
+        left = {path for path, content in damaged.items() if path.exists() and path.read_bytes() == content}
         for one in group:  # a checkpoint of a stage that is done is not looked into, and would be refused if it were
-            if (home / one.path).exists() and (home / one.path).read_bytes() == damaged[home / one.path]:
+            if home / one.path in left:
                 flip_bit(home / one.path, one.bit)
         outcome = end_of_run(home / training.name, code, output, wanted)
         yield Damage(file=name, damage="a random bit flipped", outcome=outcome, message=telling_line(output))
