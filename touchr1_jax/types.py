@@ -5,7 +5,7 @@ Dimensions, used in every name and shape of this package:
   is sensor s of the language), F frames, H W C image, A attributes, K levels of an attribute, D model width.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, UInt8
@@ -71,3 +71,16 @@ class Rollout:
     tokens: Int[Array, "*batch T"]
     log_prob: Float[Array, "*batch T"]
     mask: Bool[Array, "*batch T"]
+
+
+SAMPLE = "sample"
+"""Name under which a step that was asked for one returns a `StepSample` with its metrics."""
+
+
+class StepSample(NamedTuple):
+    """The first answer of a step to its first question: what people look at while training runs."""
+
+    asked: Bool[Array, "A"]
+    label: Int[Array, "A"]
+    tokens: Int[Array, "T"]
+    reward: Float[Array, ""]

@@ -26,7 +26,6 @@ from touchr1_jax.models.policy import Features
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.rewards import make_rewards
 from touchr1_jax.rl.config import GRPOConfig, left_out
-from touchr1_jax.rl.metrics import StepSample
 from touchr1_jax.rl.scoring import ScoreFn, make_score, reward_weights
 from touchr1_jax.text.template import AND, QUESTIONS
 from touchr1_jax.training import encoding
@@ -38,7 +37,7 @@ from touchr1_jax.training.questions import QuestionFeed
 from touchr1_jax.training.train_encoder import EncoderTrainingConfig, touch_rows, train_encoder
 from touchr1_jax.training.train_grpo import train_grpo
 from touchr1_jax.training.train_sft import SFTConfig, train_sft
-from touchr1_jax.types import Params, TouchBatch
+from touchr1_jax.types import Params, StepSample, TouchBatch
 
 Weights = Mapping[str, float]
 """Reward → weight."""

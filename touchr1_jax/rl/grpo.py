@@ -41,8 +41,6 @@ from touchr1_jax.rl.enumerated import LevelRewards, all_equal, level_rewards
 from touchr1_jax.rl.gradient import Experience, log_probs
 from touchr1_jax.rl.losses import over_tokens
 from touchr1_jax.rl.metrics import (
-    SAMPLE,
-    StepSample,
     advantage_metrics,
     answer_metrics,
     reward_metrics,
@@ -54,7 +52,7 @@ from touchr1_jax.rl.scoring import ScoreFn, WeightedScore, left_out_groups
 from touchr1_jax.rl.update import update_policy
 from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.text.template import LevelTokens
-from touchr1_jax.types import Params, Parsed, Rollout
+from touchr1_jax.types import SAMPLE, Params, Parsed, Rollout, StepSample
 
 LEAN = {"xla_cpu_use_fusion_emitters": False}
 """The newer generator holds all kernels in MLIR until the last is compiled, .5 GB even for a tiny step."""
@@ -148,7 +146,7 @@ def make_grpo_step(
       gather: all-gathers sharded weights, once before the sampling loop, which reads all of them for every token (see
         `distributed.placement.gather_params`); by default they are read as they are.
       levels: token of each level, for an algorithm that enumerates conclusions.
-      sampled: return a `metrics.StepSample` with the metrics, under the name `SAMPLE`.
+      sampled: return a `types.StepSample` with the metrics, under the name `SAMPLE`.
 
     Raises:
       ValueError: an algorithm that samples constrained, without a constraint; one that enumerates conclusions, without

@@ -1,27 +1,14 @@
 """Metrics of every step: reward and its spread, accuracy, parse rate, agreement, lengths, touch."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from touchr1_jax import masked
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rl.advantages import zero_variance
 from touchr1_jax.types import Parsed, Rollout, Target
-
-SAMPLE = "sample"
-"""Name under which a step that was asked for one returns a `StepSample` with its metrics."""
-
-
-class StepSample(NamedTuple):
-    """The first answer of a step to its first question: what people look at while training runs."""
-
-    asked: Bool[Array, "A"]
-    label: Int[Array, "A"]
-    tokens: Int[Array, "T"]
-    reward: Float[Array, ""]
 
 
 def rollout_metrics(

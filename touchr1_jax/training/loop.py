@@ -13,10 +13,10 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import jax
 import numpy as np
 
-from touchr1_jax.rl.metrics import SAMPLE, StepSample
 from touchr1_jax.skipping import count_skipped
 from touchr1_jax.training.checkpoint import Checkpoints
 from touchr1_jax.training.compilation import return_memory
+from touchr1_jax.types import SAMPLE, StepSample
 
 Step = Callable[..., tuple[Any, dict[str, jax.Array]]]
 """(state, batch, *constants) → (state, metrics), jitted; it may donate its state."""

@@ -80,5 +80,5 @@ def test_a_warm_start_that_cannot_read_touch_concludes_nothing_about_choosing():
 
     assert len(said(0.5)) == 3
     (only,) = said(-0.5)
-    assert "says nothing about choosing" in only
+    assert "does not answer how to choose" in only
     assert "+0.5" in only

@@ -154,7 +154,7 @@ def test_answers_are_enumerated_with_the_price_of_their_touches():
     algorithm = Paper(constrained=True, gamma=0.0, beta=0.0, enumerated=Norm.NONE, learn_conclusion=False)
     config = dataclasses.replace(STEP, algorithm=algorithm)
     fns, optimizer, bank = POLICY.constrained_fns, optax.sgd(1e-3), jax.tree.map(jnp.asarray, BANK)
-    engine = ActiveEngine(fns, priced_answer, optimizer, config, None, lambda p: p, fns.levels, BUDGET)
+    engine = ActiveEngine(fns, priced_answer, optimizer, config, None, lambda p: p, fns.levels, False, BUDGET)
     inputs, batch = ActiveInputs(explored.params(), bank, PRICES), explored.batch_of(0, 1, 2, 3)
     key = jax.random.key(0)
     group, metrics = jax.jit(lambda: engine.rollouts(inputs.reference, batch, inputs, key, key))()

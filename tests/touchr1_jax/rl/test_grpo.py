@@ -14,9 +14,8 @@ from tests.touchr1_jax.rl import reference
 from touchr1_jax.rl.config import GRPOConfig, Paper
 from touchr1_jax.rl.counterfactual import mask_one_stream
 from touchr1_jax.rl.grpo import FrozenInputs, GRPOState, make_grpo_step
-from touchr1_jax.rl.metrics import SAMPLE
 from touchr1_jax.rl.rollout import SampleConfig, sample_group
-from touchr1_jax.types import Parsed, Target
+from touchr1_jax.types import SAMPLE, Parsed, Target
 
 P, G, T, K = 4, 3, 4, 3
 FNS = tiny.SHALLOW

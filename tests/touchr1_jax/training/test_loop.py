@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from tests.touchr1_jax.training.stepping import feed, guarded_start, guarded_step, start, step
-from touchr1_jax.rl.metrics import SAMPLE
 from touchr1_jax.training.checkpoint import Checkpoints
 from touchr1_jax.training.loop import HELD_OUT, SKIPPED, Hooks, LoopConfig, LoopTime, NonFiniteGradientError, fetch, fit
+from touchr1_jax.types import SAMPLE
 
 STEPS = 10
 CONFIG = LoopConfig(steps=STEPS, save_every=3)
