@@ -15,6 +15,11 @@ from touchr1_jax.bench.metrics import METRICS
 MOST_POINTS = 160
 """Of a drawn line: a panel is as many points wide."""
 
+POINTS_OF_CHART = 25_000
+"""Of all lines of a chart, so that its SVG stays under a megabyte; a line keeps at least `FEWEST_POINTS`."""
+
+FEWEST_POINTS = 25
+
 WORDS = {
     "degenerate_share": "share of groups whose rewards are all equal",
     "entropy": "entropy (nat a token)",
@@ -86,9 +91,11 @@ def draw_phases(
 def training_curves(scalars: Mapping[str, Mapping[tuple[str, str], Curve]], colour: Mapping[str, str]) -> bytes:
     """Draw one panel per scalar: a thin line per seed, a bold one for the running mean over the seeds of an arm."""
     columns = min(3, len(scalars))
+    lines = sum(len(series) + len({arm for arm, _ in series}) for series in scalars.values())
+    most = min(MOST_POINTS, max(FEWEST_POINTS, POINTS_OF_CHART // lines))
     panels = [
         Panel(
-            _seeds_and_means(series, colour),
+            _seeds_and_means(series, colour, most),
             title=WORDS.get(name, name),
             x_label="step" if i >= len(scalars) - columns else "",
         )
@@ -97,27 +104,25 @@ def training_curves(scalars: Mapping[str, Mapping[tuple[str, str], Curve]], colo
     return draw(panels, size=(3.35 * columns, 0.35 + 2.15 * math.ceil(len(scalars) / columns)))
 
 
-def _seeds_and_means(series: Mapping[tuple[str, str], Curve], colour: Mapping[str, str]) -> list[Series]:
-    """All thin lines first, so that no seed covers a mean."""
+def _seeds_and_means(series: Mapping[tuple[str, str], Curve], colour: Mapping[str, str], most: int) -> list[Series]:
+    """All thin lines first, so that no seed covers a mean; a line has at most `most` points."""
     seeds, means = [], []
     for arm in dict.fromkeys(arm for arm, _ in series):
         curves = [curve for (a, _), curve in series.items() if a == arm]
         look: dict[str, Any] = {"colour": colour.get(arm, SHARED), "marker": ""}
-        seeds += [Series(x=thin(x), y=thin(y), width=0.6, alpha=0.25, **look) for x, y in curves]
+        seeds += [Series(x=thin(x, most), y=thin(y, most), width=0.6, alpha=0.25, **look) for x, y in curves]
         common = np.array(sorted(set.intersection(*(set(steps.tolist()) for steps, _ in curves))))
         if len(common):
             mean = running_mean(np.mean([values[np.isin(steps, common)] for steps, values in curves], axis=0))
-            means.append(
-                Series(
-                    arm, x=thin(common), y=thin(mean), width=1.8, **look | {"marker": "o" if len(common) == 1 else ""}
-                )
-            )
+            marker = "o" if len(common) == 1 else ""
+            look = {**look, "marker": marker, "width": 1.8}
+            means.append(Series(arm, x=thin(common, most), y=thin(mean, most), **look))
     return seeds + means
 
 
-def thin(values: np.ndarray) -> np.ndarray:
-    """At most `MOST_POINTS` of the values [n], evenly spaced and the last among them, so that a chart stays small."""
-    stride = -(-len(values) // MOST_POINTS)
+def thin(values: np.ndarray, most: int) -> np.ndarray:
+    """At most `most` of the values [n], evenly spaced and the last among them, so that a chart stays small."""
+    stride = -(-len(values) // most)
     return values[::-1][:: max(stride, 1)][::-1]
 
 

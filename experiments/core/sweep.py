@@ -11,6 +11,7 @@ import dataclasses
 import hashlib
 import itertools
 import json
+import signal
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -213,9 +214,12 @@ def run_sweep(
             print_lines(f"{i + 1} of {len(units)}, {title}: finished before, {past.directory}")
             continue
         print_lines(f"{i + 1} of {len(units)}, {title}")
-        status = run_experiment(experiment, unit.command, about)
-        jax.clear_caches()  # programs of one configuration; those of all would fill the memory
-        write_page(experiment.name, about, scale, folder, units, wanted)
+        try:
+            status = run_experiment(experiment, unit.command, about)
+            jax.clear_caches()  # programs of one configuration; those of all would fill the memory
+            write_page(experiment.name, about, scale, folder, units, wanted)
+        except KeyboardInterrupt:  # between two runs; a run handles the signal itself
+            status = 128 + signal.SIGINT
         if status > 1:
             print_lines("To continue the sweep, run the same command again.")
             return status

@@ -9,7 +9,7 @@ published consistency term.  `debiased` subtracts from the ordinal credit what a
 level is favoured, and pays for consistency only where the answer is right.  All pay −0.1 for an answer that cannot be
 parsed.  All are compared with the control that continues SFT for as many seconds (`sft_continued`).
 
-Cost: about 20 minutes on two cores with five seeds; `--scale smoke` under two.
+Cost: about 25 minutes on two cores of 180 GFLOP/s with five seeds; `--scale smoke` under two.
 
 Expected: ordinal credit pays the middle level for being near everything (answering the middle beats answering low as
 soon as p(low) < p(middle) + 2/3 p(high)), so `ordinal` should give more middle answers than `zero_one`; a lower ordinal

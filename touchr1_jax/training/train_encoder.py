@@ -64,8 +64,8 @@ def train_encoder(
     kept = {name: tree for name, tree in params.items() if name in ("decoder", *policy.frozen)}
     encoders = jax.tree.map(jnp.copy, {name: tree for name, tree in params.items() if name not in kept})
     width = jax.eval_shape(lambda p, b: read_tokens(policy.fns.encode(p, b)), params, peek(batches)).shape[-1]
-    levels = len(policy.levels), max(policy.levels)
-    trained = {"encoders": encoders, "head": {"kernel": jnp.zeros((width, *levels)), "bias": jnp.zeros(levels)}}
+    outputs = len(policy.levels) * max(policy.levels)  # in one dimension, as the sharding rules of a dense layer ask
+    trained = {"encoders": encoders, "head": {"kernel": jnp.zeros((width, outputs)), "bias": jnp.zeros(outputs)}}
     optimizer, step = encoder_program(policy, config)
     state = FineTuneState(params=trained, opt_state=optimizer.init(trained), step=jnp.zeros((), jnp.int32))
     step, state, batches = hooks.devices.shard(step, state, batches, config.batch_size, kept)
@@ -107,8 +107,8 @@ def encoder_program(
 
 def head_log_probs(levels: Sequence[int], head: Params, features: Features) -> Float[Array, "P A K"]:
     """Log-probability of every level of every attribute; −∞ for a level that an attribute lacks."""
-    logits = jnp.einsum("pw,wak->pak", read_tokens(features), head["kernel"]) + head["bias"]
-    return normalised_levels(logits, levels)
+    logits = read_tokens(features) @ head["kernel"] + head["bias"]
+    return normalised_levels(logits.reshape(len(logits), len(levels), -1), levels)
 
 
 def read_tokens(features: Features) -> Float[Array, "P W"]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experiments.core.charts import BEATEN, Panel, Rule, Series, bars, crosses, dominated, draw, speed_against_error
-from experiments.core.curves import curves_by_phase, running_mean
+from experiments.core.curves import curves_by_phase, running_mean, training_curves
 from experiments.core.look import PALETTE, colours
 from experiments.core.pictures import Heatmap, heatmaps, image_grid
 
@@ -134,3 +134,12 @@ def test_running_mean_keeps_lines_and_short_series():
     assert running_mean(line)[10:90] == pytest.approx(line[10:90])
     for short in ([1.0, 5.0], [2.0]):
         assert running_mean(np.array(short)).tolist() == short
+
+
+def test_a_chart_of_many_lines_stays_small():
+    """Twenty arms of ten seeds and 1,000 steps in twelve panels, whose points would be some 15 MB."""
+    curve = np.arange(1000), np.random.default_rng(0).normal(size=1000)
+    series = {(f"arm {i}", f"{seed}"): curve for i in range(20) for seed in range(10)}
+    scalars = {f"scalar {i}": series for i in range(12)}
+    assert len(training_curves(scalars, {})) < 3_000_000
+    assert len(training_curves({"loss": {("", "0"): curve}}, {})) > 2_000

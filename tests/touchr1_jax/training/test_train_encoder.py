@@ -9,12 +9,14 @@ import optax
 import pytest
 
 from tests.touchr1_jax import tiny
+from touchr1_jax.distributed.mesh import MeshConfig
+from touchr1_jax.distributed.rules import state_shardings
 from touchr1_jax.models.layers import SizeError
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import ModelConfig, build_policy
 from touchr1_jax.training.encoding import touch_statistics
 from touchr1_jax.training.fine_tuning import FineTuneState, label_loss
-from touchr1_jax.training.loop import Hooks
+from touchr1_jax.training.loop import Hooks, SingleDevice
 from touchr1_jax.training.train_encoder import (
     EncoderTrainingConfig,
     encoder_program,
@@ -75,7 +77,7 @@ def test_the_head_reads_what_is_there():
     features = tiny.features(0, 2)
     width = read_tokens(features).shape[-1]
     rng = np.random.default_rng(0)
-    head = {"kernel": jnp.asarray(rng.normal(size=(width, 4, 9)), jnp.float32), "bias": jnp.zeros((4, 9))}
+    head = {"kernel": jnp.asarray(rng.normal(size=(width, 36)), jnp.float32), "bias": jnp.zeros(36)}
     other = features.replace(touch=features.touch.at[:, 0].add(1.0))
     unseen = jnp.array([[False, True], [False, True]])
     read = lambda x: np.asarray(head_log_probs((3, 3, 3, 9), head, x))
@@ -100,7 +102,7 @@ def test_the_gradient_of_micro_batches_is_that_of_the_batch():
     kept = {"decoder": params.pop("decoder")}
     width = read_tokens(POLICY.fns.encode(kept | params, touch)).shape[-1]
     rng = np.random.default_rng(0)
-    head = {"kernel": jnp.asarray(rng.normal(size=(width, 4, 9)), jnp.float32), "bias": jnp.zeros((4, 9))}
+    head = {"kernel": jnp.asarray(rng.normal(size=(width, 36)), jnp.float32), "bias": jnp.zeros(36)}
     trained = {"encoders": params, "head": head}
     optimizer, step = encoder_program(POLICY, CONFIG)
     shown = some_streams(jax.random.key(0), touch.stream_mask)
@@ -128,3 +130,21 @@ def test_half_of_the_contacts_show_a_part_of_their_sensors():
 def test_a_stem_that_reads_whole_frames_drops_no_patch():
     with pytest.raises(SizeError, match="patches_kept"):
         TactileViTConfig(sensors=2, stem="statistics", patches_kept=4)
+
+
+def test_every_parameter_has_a_place_on_a_mesh():
+    """Of what is trained and of its optimizer's state; the head once had a bias that no rule fitted."""
+    batch = contacts(8)
+    params = POLICY.init(0, jax.tree.map(lambda x: x[:1], batch))
+    placed = []
+
+    class OnMesh(SingleDevice):
+        """Devices that note how a mesh would split the state."""
+
+        def shard(self, step, state, batches, rows, *shared):
+            placed.append(state_shardings(MeshConfig(data=2, fsdp=2).abstract(), state))
+            return super().shard(step, state, batches, rows, *shared)
+
+    feed = touch_rows(touch_statistics(POLICY.model.tactile, [batch]), np.arange(8), batch_size=8, seed=0)
+    train_encoder(POLICY, params, feed, EncoderTrainingConfig(steps=1, batch_size=8), Hooks(devices=OnMesh()))
+    assert placed[0].params["head"]["kernel"].spec[0] == "fsdp"
