@@ -1,0 +1,92 @@
+"""Pages in a real browser, at the widths of a desk, a tablet and a telephone: nothing is cut, no picture is missing.
+
+`make test-slow` runs every experiment at its smallest scale for this, which takes about an hour on two cores.
+"""
+
+import html
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from experiments.core.commands import find
+from experiments.core.recorded import RECORDED
+from experiments.core.runs import ROOT
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+WIDTHS_PX = (1280, 800, 390)
+MOST_BYTES = 3_000_000
+DATA = {"physiclear", "pareto_fields", "real_sensors"}
+"""Experiments on recordings, which the repository does not contain."""
+
+LOOK = """<script>window.addEventListener("load", () => {
+  const width = document.documentElement.clientWidth, cut = [];
+  for (const one of document.body.querySelectorAll("*")) {
+    if (one.parentElement.closest(".wide, pre, details:not([open])")) continue;  // these scroll, or are closed
+    const edge = one.getBoundingClientRect().right;
+    if (edge > width + 1) cut.push(`${one.tagName}.${one.className} ends at ${Math.round(edge)} of ${width} px`);
+  }
+  document.body.dataset.seen = JSON.stringify(
+    {cut: cut.slice(0, 3), missing: [...document.images].filter(i => !i.naturalWidth).length});
+});</script>"""
+"""Lists what ends beyond the page; only the copy that the test opens has it."""
+
+FRAME = """<body><iframe src="page.html" style="width:{width}px;height:2000px;border:0"></iframe><script>
+window.addEventListener("load", () => {{
+  document.body.dataset.seen = document.querySelector("iframe").contentDocument.body.dataset.seen;
+}});</script>"""
+"""A browser's own window cannot be as narrow as a telephone."""
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no chromium here")]
+
+
+def look(page: Path, width: int, folder: Path) -> dict[str, object]:
+    """What a browser finds on a page of some width."""
+    copied = page.read_text(encoding="utf-8").replace("</body>", f"{LOOK}</body>")
+    (folder / "page.html").write_text(copied, encoding="utf-8")
+    (folder / "frame.html").write_text(FRAME.format(width=width), encoding="utf-8")
+    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--allow-file-access-from-files"]
+    size = ["--window-size=1400,2000", "--virtual-time-budget=10000", f"--user-data-dir={folder / 'profile'}"]
+    command = [str(CHROMIUM), *flags, *size, "--dump-dom", (folder / "frame.html").as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    (seen,) = re.findall(r'<body data-seen="([^"]*)"', done.stdout)
+    return json.loads(html.unescape(seen))
+
+
+def check(page: Path, folder: Path) -> None:
+    assert page.stat().st_size < MOST_BYTES
+    for width in WIDTHS_PX:
+        assert look(page, width, folder) == {"cut": [], "missing": 0}, f"{page.name} at {width} px"
+
+
+def run(*arguments: str) -> None:
+    done = subprocess.run([sys.executable, "-m", "experiments", *arguments], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+def test_a_column_that_is_cut_is_found(tmp_path):
+    page = tmp_path / "report.html"
+    page.write_text('<body><p style="width:900px">wide</p><img src="none.png"></body>')
+    assert look(page, 1280, tmp_path) == {"cut": [], "missing": 1}
+    assert look(page, 800, tmp_path)["cut"] == ["P. ends at 908 of 800 px"]
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in (ROOT / RECORDED).glob("*.json")))
+def test_pages_of_recorded_runs_fit(name, tmp_path):
+    run("show", name, "--runs-dir", str(tmp_path))
+    check(tmp_path / name / "recorded" / "report.html", tmp_path)
+
+
+@pytest.mark.parametrize("name", sorted({*find("experiments")} - DATA))
+def test_pages_of_smoke_runs_fit(name, tmp_path, cache):
+    run(name, "--scale", "smoke", "--runs-dir", str(tmp_path), "--cache-dir", str(cache))
+    check(tmp_path / name / "latest" / "report.html", tmp_path)
