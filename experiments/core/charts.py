@@ -43,6 +43,10 @@ Values = Sequence[float] | np.ndarray
 """Numbers [N]."""
 
 Scale = Literal["linear", "log", "symlog"]
+Better = Literal["lower", "higher"]
+
+BEATEN = "×: another one is as good on both axes and better on one"
+"""Title of a panel whose dominated points are crossed."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -128,6 +132,7 @@ class Panel:
       stacked: whether bars of several series are put end to end.
       written: format of the figure at the end of each bar, such as ".2g"; none by default.
       linear_to: see `x_scale`.
+      better: which x and which y are better; points with markers that another one dominates are crossed.
     """
 
     series: Sequence[Series]
@@ -147,6 +152,7 @@ class Panel:
     stacked: bool = False
     written: str = ""
     linear_to: float = 1.0
+    better: tuple[Better, Better] | None = None
 
 
 def draw(
@@ -164,7 +170,7 @@ def draw(
     """
     columns = min(columns, len(panels))
     lines = math.ceil(len(panels) / columns)
-    panels = _resolved(panels)
+    panels = _resolved([_crossed(panel) if panel.better else panel for panel in panels])
     with mpl.rc_context(LOOK):
         figure = Figure(figsize=size or _size(panels, columns, lines), layout="constrained")
         grid = figure.subplots(lines, columns, squeeze=False, sharex=share_x, sharey=share_y).ravel()
@@ -206,9 +212,6 @@ def bars(
     return draw([panel])
 
 
-BEATEN = "×: another choice is no slower and no less accurate"
-"""Title of a chart whose dominated choices are crossed."""
-
 Point = tuple[str, float, float, float]
 """Name, ms a frame, median error, 95th percentile of the error."""
 
@@ -225,26 +228,25 @@ def speed_against_error(
     for kind, points in groups.items():
         names, ms, median, high = zip(*points, strict=True)
         series.append(Series(kind, x=ms, y=median, high=high, labels=names))
-    every = [point[1:3] for points in groups.values() for point in points]
-    beaten = crosses(every, dominated(every))
-    title = BEATEN if beaten else ""
-    series += beaten
     rules = [] if goal is None else [Rule(x=goal[0], y=goal[1])]
     axes: dict[str, Any] = {"x_scale": "log", "y_scale": "log", "x_label": "time a frame, ms", "y_label": error}
-    return draw([Panel(series, **axes, rules=rules, title=title)], size=(7.4, 4.6), legend=legend)
+    return draw([Panel(series, **axes, rules=rules, better=("lower", "lower"))], size=(7.4, 4.6), legend=legend)
 
 
-def dominated(costs: Sequence[Sequence[float]]) -> list[bool]:
+def dominated(costs: Sequence[Sequence[float] | np.ndarray]) -> list[bool]:
     """For each choice, whether another one costs no more in any respect and less in one; NaN dominates nothing."""
-    every = np.asarray(costs, float).reshape(len(costs), -1)
+    every = np.asarray(costs, float)
     return [bool(((every <= one).all(-1) & (every < one).any(-1)).any()) for one in every]
 
 
-def crosses(points: Sequence[Sequence[float]], marked: Sequence[bool]) -> list[Series]:
-    """A cross on each marked point (x, y)."""
-    at = [point for point, mark in zip(points, marked, strict=True) if mark]
-    x, y = [point[0] for point in at], [point[1] for point in at]
-    return [Series(x=x, y=y, line="", marker="x", colour="0.35", size=70.0)] if at else []
+def _crossed(panel: Panel) -> Panel:
+    """The panel with a cross on each dominated point."""
+    points = [point for s in panel.series if s.marker != "" for point in zip(s.x, s.y, strict=True)]
+    costs = [[x if better == "lower" else -x for x, better in zip(p, panel.better or (), strict=True)] for p in points]
+    at = np.array([point for point, mark in zip(points, dominated(costs), strict=True) if mark]).reshape(-1, 2)
+    cross = Series(x=at[:, 0], y=at[:, 1], line="", marker="x", colour="0.35", size=70.0)
+    title = "\n".join(filter(None, (panel.title, BEATEN)))
+    return dataclasses.replace(panel, series=[*panel.series, cross], title=title) if len(at) else panel
 
 
 def _resolved(panels: Sequence[Panel]) -> list[Panel]:

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.core.charts import BEATEN, Panel, Rule, Series, crosses, dominated, draw
+from experiments.core.charts import Panel, Rule, Series, draw
 from experiments.core.context import Context
 from experiments.core.results import Cell, Picture, Results, Table, at_least, at_most, named_table
 from experiments.core.runner import Experiment
@@ -272,15 +272,13 @@ def accuracy_chart(measured: Mapping[str, MeasuredVariant], losses: Mapping[str,
         low, high = ([reference - getattr(losses[name], end) for name in named] for end in ("high", "low"))
         x, y = [1e3 / m.rate for m in named.values()], [m.accuracy for m in named.values()]
         series.append(Series(f"saving in {kind}", x=x, y=y, low=low, high=high, **look))
-    points = [(1e3 / m.rate, m.accuracy) for m in measured.values()]
-    beaten = crosses(points, dominated([(x, -y) for x, y in points]))
     panel = Panel(
-        [*series, *beaten],
-        title=BEATEN if beaten else "",
+        series,
         x_label="forward, ms a prompt of 8 frames × 4 sensors",
         y_label="probes right, %",
         x_scale="log",
         rules=[Rule(x=1e3 / LEAST_RATE, y=reference - MOST_LOSS, keep="above")],
+        better=("lower", "higher"),
     )
     return draw([panel], size=(8.4, 5.0))
 

@@ -232,7 +232,13 @@ def cost_and_gain(target: float, curves: Curves) -> bytes:
         right += [Series(**ring, **cost)] if default else []
     label = f"time to a mean reward of {target:g}, s"
     panels = [
-        Panel(left, x_label="a step, ms", y_label="score: mean reward at the end", rules=[Rule(y=target)]),
+        Panel(
+            left,
+            x_label="a step, ms",
+            y_label="score: mean reward at the end",
+            rules=[Rule(y=target)],
+            better=("lower", "higher"),
+        ),
         Panel(right, x_label=label, x_limits=(0, None), rows=names),
     ]
     return draw(panels, size=(9.0, 4.2))

@@ -334,7 +334,8 @@ def _speed_picture(tasks: Mapping[str, Rows]) -> Picture:
             group = [row for row in rows.values() if row.kind == kind]
             y, high = ([max(r.median, LEAST_ERROR) for r in group], [max(r.high, LEAST_ERROR) for r in group])
             series.append(Series(kind, x=[r.ms for r in group], y=y, high=high, labels=[r.label for r in group]))
-        panels.append(Panel(series, title=TITLES[task], x_label=x_label, y_label=y_label, x_scale="log", y_scale="log"))
+        axes: dict[str, Any] = {"x_label": x_label, "y_label": y_label, "x_scale": "log", "y_scale": "log"}
+        panels.append(Panel(series, title=TITLES[task], **axes, better=("lower", "lower")))
     return Picture(
         name="pareto_tangential",
         title="Speed against error",

@@ -188,7 +188,7 @@ def phase_chart(found: Mapping[Lengths, PhaseResult]) -> bytes:
             of = [result for length, result in found.items() if length[:2] == (phase, first)]
             x, y = [result.seconds for result in of], [getattr(result, field) for result in of]
             series.append(Series(f"{first} steps, {phase}", x=x, y=y, marker="o"))
-        panels.append(Panel(series, x_label="seconds of training", y_label=label))
+        panels.append(Panel(series, x_label="seconds of training", y_label=label, better=("lower", "higher")))
     return draw(panels, size=(8.2, 3.6))
 
 

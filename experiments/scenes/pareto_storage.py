@@ -41,7 +41,6 @@ from experiments.scenes.storage_codecs import (
     CodecMeasurement,
     all_codecs,
     chosen_filters,
-    front,
     measure,
 )
 from sensors_io.augment import AugmentConfig
@@ -330,7 +329,7 @@ def _other_tables(
 
 def _picture(number: int, kind: str, every: Sequence[CodecMeasurement]) -> Picture:
     rows = [row for row in every if row.exact]
-    best, own = front(rows), _of(rows, OWN)
+    own = _of(rows, OWN)
     panels = []
     for label, rate in (("read", lambda row: row.read_fps), ("written", lambda row: row.write_fps)):
         series = []
@@ -339,9 +338,6 @@ def _picture(number: int, kind: str, every: Sequence[CodecMeasurement]) -> Pictu
             names = [row.codec.name.removesuffix(" zstd-1") for row in group]
             series.append(Series(codecs, x=[*map(rate, group)], y=[r.bytes for r in group], labels=names, line=""))
         series.append(Series(x=[rate(own)], y=[own.bytes], marker="o", hollow=True, size=130, colour="black"))
-        if label == "read":
-            x, y = [*map(rate, best)], [row.bytes for row in best]
-            series.append(Series(x=x, y=y, marker="", colour=SHARED, width=0.8))
         panels.append(
             Panel(
                 series,
@@ -351,13 +347,14 @@ def _picture(number: int, kind: str, every: Sequence[CodecMeasurement]) -> Pictu
                 y_scale="log",
                 y_format="{x:,.0f}",
                 rules=[Rule(x=NEED_FPS, colour=SHARED)] if label == "read" else [],
+                better=("higher", "lower"),
             )
         )
     return Picture(
         name=f"pareto_storage_{number}",
         title=f"Size against rate: {kind}",
-        caption="Ringed: the records' codec. The line joins those that no other one beats in size and read rate; the "
-        "dotted line is the read rate that the rule requires. Codecs that lose bits are left out.",
+        caption="Ringed: the records' codec. The dotted line is the read rate that the rule requires. Codecs that lose "
+        "bits are left out.",
         content=draw(panels, share_y=True, size=(11.0, 6.4)),
     )
 

@@ -209,13 +209,6 @@ def measure(
     return rows, missing
 
 
-def front(rows: Sequence[CodecMeasurement]) -> list[CodecMeasurement]:
-    """Those that no other one beats in size and in read rate, by size."""
-    ordered = sorted(rows, key=lambda row: (row.bytes, -row.read_fps))
-    fastest = np.maximum.accumulate([0.0, *(row.read_fps for row in ordered)])
-    return [row for row, best in zip(ordered, fastest, strict=False) if row.read_fps > best]
-
-
 def chosen_filters(clips: Iterable[np.ndarray]) -> dict[str, int]:
     """Number of clips that choose each filter."""
     names = [choose_filter(clip) for clip in clips]

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from experiments.core.charts import BEATEN, Panel, Rule, Series, bars, crosses, dominated, draw, speed_against_error
+from experiments.core.charts import BEATEN, Panel, Rule, Series, bars, dominated, draw, speed_against_error
 from experiments.core.curves import curves_by_phase, running_mean, training_curves
 from experiments.core.look import PALETTE, colours
 from experiments.core.pictures import Heatmap, heatmaps, image_grid
@@ -85,12 +85,13 @@ def test_points_are_named_unless_missing_and_the_same_data_give_the_same_bytes()
 def test_dominated_choices_are_crossed():
     points = [(1.0, 2.0), (2.0, 1.0), (2.0, 2.0), (1.0, 2.0), (np.nan, 0.0)]
     assert dominated(points) == [False, False, True, False, False]
-    (series,) = crosses(points, dominated(points))
-    assert (series.x, series.y, series.marker) == ([2.0], [2.0], "x")
-    assert crosses(points[:2], [False, False]) == []
     named = [(str(i), *point, point[1]) for i, point in enumerate(points[:3])]
     assert BEATEN in texts(speed_against_error({"kind": named}, "error", None))
     assert BEATEN not in texts(speed_against_error({"kind": named[:2]}, "error", None))
+    higher = Panel([Series("kind", x=[1, 2, 2], y=[2, 1, 2])], better=("lower", "higher"))
+    assert BEATEN in texts(draw([higher]))  # (2, 1) is slower and worse than (1, 2)
+    line = Panel([Series(x=[1, 2], y=[2, 1], marker="")], better=("lower", "higher"))
+    assert BEATEN not in texts(draw([line]))
 
 
 def test_a_heatmap_names_its_rows_columns_and_cells():

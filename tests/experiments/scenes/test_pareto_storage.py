@@ -8,7 +8,7 @@ import pytest
 from experiments.core.artifacts import read_json
 from experiments.scenes import pareto_storage
 from experiments.scenes.pareto_storage import CHANGES, GENERATED, IMPORTED, STILLS, WHOLE, FeedConfig, recorded_clips
-from experiments.scenes.storage_codecs import OWN, CodecMeasurement, all_codecs, chosen_filters, front
+from experiments.scenes.storage_codecs import OWN, CodecMeasurement, all_codecs, chosen_filters
 from tests.experiments import tiny
 from tests.experiments.shrunk import run_shrunk
 from tests.sensors_io.importers.films import film, picture
@@ -77,9 +77,8 @@ def measured(name, size, read):
     return CodecMeasurement(codec=codec, bytes=size, write_fps=1.0, read_fps=read, exact=True)
 
 
-def test_the_front_and_the_rule_by_hand():
+def test_the_rule_by_hand():
     group = [measured(*row) for row in (("raw", 100, 90), ("a", 50, 40), ("b", 60, 30), ("c", 20, 10), (OWN, 45, 20))]
-    assert [row.codec.name for row in front(group)] == ["c", OWN, "a", "raw"]
     rows = {GENERATED: group, IMPORTED: group}
     assert pareto_storage.fastest_small(rows, 15).name == OWN
     assert pareto_storage.fastest_small(rows, 35).name == "a"
