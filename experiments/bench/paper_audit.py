@@ -8,7 +8,7 @@ granted.  Nothing is trained and no data is read.
 
 Cost: seconds.
 
-Expected: fourteen statements that its own numbers contradict, do not support or leave open, and ten that they confirm.
+Expected: fifteen statements that its own numbers contradict, do not support or leave open, and ten that they confirm.
 So results here are compared with the directions of the paper, never with its values.
 """
 

@@ -267,6 +267,14 @@ def _data_and_units() -> Iterator[StatementCheck]:
         f"that makes {paper.OBJECTS * each:,}; {paper.SEQUENCES:,} are {paper.SEQUENCES / each:.0f} objects",
         paper.OBJECTS * each > paper.SEQUENCES,
     )
+    printed = (paper.RECORDS, paper.SEQUENCES, paper.SFT_QA, paper.RL_QA)
+    yield _check(
+        "The announced release is another data set",
+        "authors' page; acquisition, training data and protocol",
+        ", ".join(f"{count:,} {name}" for name, count in paper.ANNOUNCED.items()),
+        f"printed are {', '.join(f'{count:,}' for count in printed)}",
+        tuple(paper.ANNOUNCED.values()) != printed,
+    )
     shares = {name: row[:4] for name, (row, _) in paper.VTV.items()}
     fit = {name: sum(attainable(share, paper.VTV_ITEMS) for share in row) for name, row in shares.items()}
     others = sum(fit.values()) - fit["Ours"]

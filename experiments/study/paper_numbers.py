@@ -112,6 +112,9 @@ HELD_OUT_OBJECTS = 200
 PRETRAIN_FRAMES, SFT_QA, RL_QA = 1_000_000, 240_000, 120_000
 """Section 4.1, "Training data and protocol": three disjoint subsets of the training split."""
 
+ANNOUNCED = {"frames": 2_820_000, "sequences": 12_183, "questions for SFT": 230_000, "for reinforcement": 100_000}
+"""Counts that the authors' page announces for their release, which is still empty."""
+
 REWARD_WEIGHTS: Mapping[str, float] = {"accuracy": 0.6, "cross-sensor consistency": 0.3, "format": 0.1}
 """Section 3.2, the equation of the total reward."""
 

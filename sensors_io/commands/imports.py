@@ -1,6 +1,7 @@
 """`python -m sensors_io import`."""
 
 import dataclasses
+import json
 import pathlib
 import shlex
 from typing import Annotated
@@ -12,7 +13,10 @@ from sensors_io.commands.console import OUT, progress_bar
 from sensors_io.importers.catalogue import Catalogue, import_catalogue
 from sensors_io.importers.estimate_modulus import list_estimate_modulus
 from sensors_io.importers.feelanyforce import FeelAnyForceConfig, list_feelanyforce
-from sensors_io.importers.keep import ImportConfig, Keep, Shares
+from sensors_io.importers.hdf5 import HDF5Config, hdf5_files, list_hdf5
+from sensors_io.importers.hdf5_inspect import UNKNOWN_UNIT, describe, propose
+from sensors_io.importers.hdf5_read import HDF5Error
+from sensors_io.importers.keep import ImportConfig, ImportSourceError, Keep, Shares
 from sensors_io.importers.octopi import list_octopi
 from sensors_io.importers.physiclear import PhysiclearConfig, list_physiclear
 from sensors_io.importers.tac3d import list_tac3d
@@ -145,8 +149,37 @@ class Videos(_Paths):
         return list_videos(self.source, self.config)
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Hdf5:
+    """HDF5 files of any layout, by a mapping of their paths, units and axes."""
+
+    source: tyro.conf.Positional[pathlib.Path]
+    """Directory of the files, or one file."""
+    out: pathlib.Path = pathlib.Path("records")
+    """Directory of the records."""
+    inspect: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print what the first file contains, and a mapping to begin with, and import nothing."""
+    config: HDF5Config = dataclasses.field(default_factory=HDF5Config)
+
+    def catalogue(self) -> Catalogue:
+        return list_hdf5(self.source, self.config)
+
+    def show(self) -> int:
+        """Print contents and proposal."""
+        first = hdf5_files(self.source)[0]
+        try:
+            lines, proposal = describe(first), propose(first)
+        except HDF5Error as error:
+            raise ImportSourceError(f"{first} {error}; fetch it again, or leave it out") from error
+        for line in (*lines, "", f"A mapping; replace each {UNKNOWN_UNIT!r}, and save it for --map:", ""):
+            OUT.print(line, markup=False, highlight=False, soft_wrap=True)
+        OUT.print(json.dumps(proposal, indent=2), markup=False, highlight=False, soft_wrap=True)
+        return 0
+
+
 DataSet = (
     Annotated[Videos, tyro.conf.subcommand("videos")]
+    | Annotated[Hdf5, tyro.conf.subcommand("hdf5")]
     | Annotated[Physiclear, tyro.conf.subcommand("physiclear")]
     | Annotated[Octopi, tyro.conf.subcommand("octopi")]
     | Annotated[TouchAndGo, tyro.conf.subcommand("touch-and-go")]
@@ -167,6 +200,8 @@ class Import:
     dataset: DataSet
 
     def run(self) -> int:
+        if isinstance(self.dataset, Hdf5) and self.dataset.inspect:
+            return self.dataset.show()
         catalogue = self.dataset.catalogue()
         with progress_bar("contacts") as progress:
             report = import_catalogue(catalogue, self.dataset.out, progress=progress)

@@ -58,7 +58,15 @@ def read_picture(path: pathlib.Path) -> np.ndarray:
     """
     if not path.is_file():
         raise PictureError("is absent")
-    data = path.read_bytes()
+    return decode_picture(path.read_bytes())
+
+
+def decode_picture(data: bytes) -> np.ndarray:
+    """One picture from the bytes of its file, uint8 [H, W, 3], RGB.
+
+    Raises:
+      PictureError: they are cut off, or no picture.
+    """
     end = _END.get(data[:2])
     if end is not None and end not in data[-_TAIL:]:
         raise PictureError("is cut off")

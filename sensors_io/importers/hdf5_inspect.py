@@ -1,0 +1,161 @@
+"""Contents of an HDF5 file as lines of text, and a mapping of them to begin with.
+
+The proposal goes by names, shapes and stated units.  What it cannot know it writes as "?", which `read_map` refuses by
+name, so that nobody imports a guess about a unit.
+"""
+
+import pathlib
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from sensors_io.importers.hdf5_map import QUANTITIES, UNITS
+from sensors_io.importers.hdf5_read import SPELLED, STATED, h5py, opened
+from sensors_io.schema import SENSORS
+
+UNKNOWN_UNIT = "?"
+DEEPEST = 3
+"""Groups above a contact that a proposal looks through."""
+
+NAMES: Mapping[str, str] = {
+    "depth_mm": "depth|height|indent",
+    "shear_mm": "shear|marker|flow",
+    "deformation_mm": "deform|displac",
+    "moment_nmm": "moment|torque",
+    "force_n": "force|wrench|ft",
+    "host_time_ns": "time|stamp|^ts?$",
+}
+"""Array of the schema → pattern of the last part of a path."""
+
+
+def describe(path: pathlib.Path) -> tuple[str, ...]:
+    """A line for each group and data set; groups of equal contents are listed once and counted.
+
+    Raises:
+      HDF5Error: it is damaged.
+    """
+    with opened(path) as file:
+        return (f"{path.name}", *_lines(file, "  "))
+
+
+def propose(path: pathlib.Path) -> dict[str, Any]:
+    """A mapping of the file's layout, as JSON; "?" where a person must decide.
+
+    Raises:
+      HDF5Error: the file is damaged.
+    """
+    with opened(path) as file:
+        pattern, group = _contacts(file)
+        found = {name: data for name, data in _datasets(group) if data.dtype.kind in "fiuO"}
+        rows = next(({kind: f"/{n}"} for n in found for kind in ("lengths", "offsets") if kind[:6] in n.lower()), None)
+        sensors: dict[str, dict[str, Any]] = {}
+        arrays = {name: kind for name, data in found.items() if (kind := _kind(name, data)) is not None}
+        for name, kind in arrays.items():
+            if kind in ("frames", "depth_mm", "deformation_mm"):
+                sensors.setdefault(_sensor(name), {})
+        for name, kind in arrays.items():
+            entry = _entry(name, kind, found[name], rows)
+            of = [s for s in sensors if s == _sensor(name)] or list(sensors)  # a force sensor serves all of them
+            for sensor in of:
+                if kind == "host_time_ns" and sensor != _sensor(name):
+                    continue
+                times = [t for t, k in arrays.items() if k == "host_time_ns" and _folder(t) == _folder(name)]
+                own = {"time": _entry(times[0], "host_time_ns", found[times[0]], rows)} if times else {}
+                sensors[sensor].setdefault(kind, entry | (own if sensor != _sensor(name) else {}))
+        for stream in sensors.values():
+            if "host_time_ns" not in stream:
+                stream["rate_hz"] = UNKNOWN_UNIT
+        named = next((a for a in group.attrs if "object" in a.lower()), None)
+        object_id = {"object_id": {"attribute": named}} if named else {}
+        return {"source": path.parent.name, "licence": "?", "contact": pattern, **object_id, "sensors": sensors}
+
+
+def _lines(group: Any, indent: str) -> Iterator[str]:
+    for name, value in group.attrs.items():
+        yield f"{indent}@{name} = {value!s:.60}"
+    seen: Counter[tuple[Any, ...]] = Counter()
+    for name, item in group.items():
+        if isinstance(item, h5py().Dataset):
+            stated = ", ".join(f"{a} {item.attrs[a]}" for a in STATED if a in item.attrs)
+            yield f"{indent}{name}  {item.dtype}{list(item.shape)}{f'  ({stated})' if stated else ''}"
+            continue
+        contents = _contents(item)
+        seen[contents] += 1
+        if seen[contents] == 1:
+            yield f"{indent}{name}/"
+            yield from _lines(item, indent + "  ")
+    more = sum(seen.values()) - len(seen)
+    if more:
+        yield f"{indent}… and {more} groups of the same contents"
+
+
+def _contents(group: Any) -> tuple[Any, ...]:
+    return tuple((name, str(data.dtype), data.ndim) for name, data in _datasets(group))
+
+
+def _datasets(group: Any) -> Iterator[tuple[str, Any]]:
+    found: list[tuple[str, Any]] = []
+    group.visititems(lambda name, item: found.append((name, item)) if isinstance(item, h5py().Dataset) else None)
+    yield from found
+
+
+def _contacts(file: Any) -> tuple[str, Any]:
+    """Pattern of the groups that most often have the same contents, with something to see, and the first of them."""
+    levels: dict[int, list[Any]] = {0: [file]}
+    for depth in range(1, DEEPEST + 1):
+        inside = (item for parent in levels[depth - 1] for item in parent.values())
+        levels[depth] = [item for item in inside if isinstance(item, h5py().Group)]
+    best: tuple[int, str, Any] = (0, "/", file)
+    for depth, groups in levels.items():
+        visible = [g for g in groups if any(_kind(n, d) in ("frames", "depth_mm") for n, d in _datasets(g))]
+        counts = Counter(_contents(g) for g in visible)
+        if counts:
+            contents, number = counts.most_common(1)[0]
+            same = [g for g in visible if _contents(g) == contents]
+            if number > best[0]:
+                parts = [g.name.strip("/").split("/") for g in same]
+                shared = [
+                    next(iter(c)) if len(c) == 1 and depth > 1 else "*" for c in map(set, zip(*parts, strict=True))
+                ]
+                best = number, "/" + "/".join(shared[:depth]) if depth else "/", same[0]
+    return best[1], best[2]
+
+
+def _kind(name: str, data: Any) -> str | None:
+    """The array of the schema that a data set seems to be."""
+    last = name.rpartition("/")[2].lower()
+    pictures = data.dtype == np.uint8 and (data.ndim == 4 or data.ndim == 2)
+    if pictures or h5py().check_vlen_dtype(data.dtype) == np.uint8:
+        return "frames"
+    kinds = (kind for kind, pattern in NAMES.items() if re.search(pattern, last))
+    return next((kind for kind in kinds if data.ndim == len(QUANTITIES[kind].axes)), None)
+
+
+def _entry(name: str, kind: str, data: Any, rows: Mapping[str, str] | None) -> dict[str, Any]:
+    quantity, entry = QUANTITIES[kind], {"path": name}
+    said = next((str(data.attrs[a]) for a in STATED if a in data.attrs), "")
+    unit = SPELLED.get(said.strip().lower(), said.strip())
+    if kind != "frames":
+        entry["unit"] = unit if unit in UNITS[quantity.kind] else UNKNOWN_UNIT
+    whole: dict[str, Any] = dict(entry)
+    if kind == "frames" and data.ndim < 4:
+        whole["encoded"] = True
+    elif kind == "frames" and data.shape[-1] != len(quantity.components):
+        whole["axes"] = "NCHW"
+    elif quantity.components and data.shape[-1] > len(quantity.components):
+        whole["components"] = [*quantity.components, *[None] * (data.shape[-1] - len(quantity.components))]
+    return whole if rows is None else whole | {"rows": dict(rows)}
+
+
+def _folder(name: str) -> str:
+    return name.rpartition("/")[0]
+
+
+def _sensor(name: str) -> str:
+    """The sensor of a data set: one that the path names, else the group that it lies in."""
+    plain = re.sub(r"[^a-z0-9]", "", name.lower())
+    known = next((s for s in SENSORS if s.replace("_", "") in plain or s.partition("_")[0] in plain), None)
+    return known or re.sub(r"[^A-Za-z0-9.\-]+", "_", _folder(name)).strip("_.-") or "sensor"

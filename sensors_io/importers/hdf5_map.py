@@ -1,0 +1,273 @@
+"""Mapping of an HDF5 layout to the schema: where the arrays of each sensor lie, in which units, axes and rows.
+
+    {
+      "source": "TouchReason", "licence": "CC BY 4.0",
+      "contact": "/trials/*",
+      "object_id": {"attribute": "object"}, "motion": {"value": "press"},
+      "labels": {"hardness": {"path": "labels/hardness"}},
+      "sensors": {
+        "gelsight_mini": {
+          "frames": {"path": "gelsight/rgb"},
+          "host_time_ns": {"path": "gelsight/time", "unit": "s"},
+          "depth_mm": {"path": "gelsight/depth", "unit": "m", "axes": "HWN"},
+          "force_n": {"path": "ft/force", "unit": "N", "components": ["x", "-y", "z"],
+                      "time": {"path": "ft/time", "unit": "s"}}
+        }
+      }
+    }
+
+`contact` is a pattern of groups, each one contact; "/" takes a file for one.  A path is relative to that group, or to
+the file with a leading "/".
+"""
+
+import dataclasses
+import json
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+from sensors_io.importers.keep import ImportSourceError
+from sensors_io.schema import ATTRIBUTES
+
+UNITS: Mapping[str, Mapping[str, float]] = {
+    "picture": {"": 1.0, "1": 255.0},
+    "length": {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3},
+    "force": {"N": 1.0, "mN": 1e-3},
+    "moment": {"N mm": 1.0, "N m": 1e3},
+    "time": {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0},
+}
+"""Quantity → unit → factor to the unit of the schema; a picture in "1" runs from 0 to 1."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Quantity:
+    """An array of the schema that a map may name.
+
+    Args:
+      kind: key of `UNITS`.
+      axes: of the schema, without the components.
+      components: of the last axis, none for a scalar.
+      most: greatest magnitude that a tactile sensor gives, in the schema's unit.
+      least: magnitude that the greatest value of a contact must reach, or all of them are 0.
+    """
+
+    kind: str
+    axes: str
+    components: tuple[str, ...] = ()
+    most: float = float("inf")
+    least: float = 0.0
+
+
+QUANTITIES: Mapping[str, Quantity] = {
+    "frames": Quantity(kind="picture", axes="NHWC", components=("r", "g", "b")),
+    "depth_mm": Quantity(kind="length", axes="NHW", most=20.0, least=1e-3),
+    "deformation_mm": Quantity(kind="length", axes="NHWC", components=("x", "y"), most=20.0, least=1e-3),
+    "shear_mm": Quantity(kind="length", axes="NHWC", components=("x", "y"), most=20.0, least=1e-3),
+    "force_n": Quantity(kind="force", axes="NC", components=("x", "y", "z"), most=500.0),
+    "moment_nmm": Quantity(kind="moment", axes="NC", components=("x", "y", "z"), most=5e4),
+    "host_time_ns": Quantity(kind="time", axes="N"),
+    "device_time_ns": Quantity(kind="time", axes="N"),
+}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RowsMap:
+    """Rows of a contact in arrays that hold the rows of many, by the `lengths` or the `offsets` of all contacts."""
+
+    path: str
+    kind: str
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ArrayMap:
+    """Where one array lies and what it means.
+
+    Args:
+      path: of the data set.
+      factor: to the unit of the schema; `unit` as the map gives it.
+      axes: of the data set in its order, such as "NCHW"; pictures without C are grey.
+      components: along its axis C in its order, with "-" before one of the opposite sign; "" for one to leave out.
+      rows: of a contact, where the data set holds those of many.
+      time: of its own rows, where it was sampled by another clock than the frames.
+      encoded: its rows are JPEG or PNG files.
+      optional: a contact may lack it.
+    """
+
+    path: str
+    unit: str
+    factor: float
+    axes: str
+    components: tuple[str, ...]
+    rows: RowsMap | None = None
+    time: "ArrayMap | None" = None
+    encoded: bool = False
+    optional: bool = False
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ValueMap:
+    """A value of a contact: an `attribute` of its group or one above, the `path` of a number or text, or a `value`."""
+
+    kind: str
+    value: Any
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StreamMap:
+    """Arrays of one sensor by their names in the schema, and the rate of frames where no time is stored."""
+
+    arrays: Mapping[str, ArrayMap]
+    rate_hz: float | None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LayoutMap:
+    """A whole mapping; `values` are those of object_id, site, motion and trial that it states."""
+
+    source: str
+    licence: str
+    contact: str
+    values: Mapping[str, ValueMap]
+    labels: Mapping[str, ValueMap]
+    sensors: Mapping[str, StreamMap]
+
+
+def read_map(path: pathlib.Path) -> LayoutMap:
+    """Read and check a mapping.
+
+    Raises:
+      ImportSourceError: no such file, no JSON, or an entry that does not fit; the message names it.
+    """
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise ImportSourceError(f"{path} is no mapping: {error}; write one, as `--inspect` proposes") from error
+    root = _Entry(found, path.name)
+    root.know("source", "licence", "contact", "labels", "sensors", *_VALUES)
+    sensors = root.part("sensors")
+    if not sensors.found:
+        raise ImportSourceError(f"{sensors.name} is empty: must name at least one sensor; add its arrays")
+    labels = root.part("labels", {})
+    labels.know(*ATTRIBUTES)
+    return LayoutMap(
+        source=root.text("source", "HDF5 recordings"),
+        licence=root.text("licence", "all rights reserved"),
+        contact=root.text("contact", "/"),
+        values={name: _value(root.part(name)) for name in _VALUES if name in root.found},
+        labels={name: _value(labels.part(name)) for name in labels.found},
+        sensors={name: _stream(sensors.part(name)) for name in sensors.found},
+    )
+
+
+_VALUES = ("object_id", "site", "motion", "trial")
+
+
+class _Entry:
+    """An object of the mapping, whose wrong entries are named in full."""
+
+    def __init__(self, found: Any, name: str) -> None:
+        if not isinstance(found, dict):
+            raise ImportSourceError(f"{name} is {found!r:.60}: must be an object; correct it")
+        self.found, self.name = found, name
+
+    def part(self, key: str, otherwise: Any = None) -> "_Entry":
+        return _Entry(self.found.get(key, otherwise), f"{self.name}: {key}")
+
+    def know(self, *keys: str) -> None:
+        unknown = [key for key in self.found if key not in keys]
+        if unknown:
+            raise ImportSourceError(f"{self.name}: {unknown[0]!r} must be one of {', '.join(keys)}; correct it")
+
+    def text(self, key: str, otherwise: str | None = None) -> str:
+        value = self.found.get(key, otherwise)
+        if not isinstance(value, str):
+            raise ImportSourceError(f"{self.name}: {key} is {value!r:.60}: must be a text; give it")
+        return value
+
+    def choice(self, key: str, otherwise: str | None, choices: Mapping[str, Any]) -> str:
+        value = self.text(key, otherwise)
+        if value not in choices:
+            listed = ", ".join(map(repr, choices))
+            raise ImportSourceError(f"{self.name}: {key} is {value!r}: must be one of {listed}; correct it")
+        return value
+
+    def switch(self, key: str) -> bool:
+        value = self.found.get(key, False)
+        if not isinstance(value, bool):
+            raise ImportSourceError(f"{self.name}: {key} is {value!r:.60}: must be true or false; correct it")
+        return value
+
+    def one_of(self, *keys: str) -> tuple[str, Any]:
+        """The only entry, with its key."""
+        if len(self.found) != 1 or next(iter(self.found)) not in keys:
+            raise ImportSourceError(
+                f"{self.name} holds {[*self.found]}: must hold one of {', '.join(keys)}; correct it"
+            )
+        ((key, value),) = self.found.items()
+        return key, value
+
+
+def _value(entry: _Entry) -> ValueMap:
+    kind, value = entry.one_of("attribute", "path", "value")
+    if kind != "value":
+        entry.text(kind)
+    return ValueMap(kind=kind, value=value)
+
+
+def _stream(entry: _Entry) -> StreamMap:
+    entry.know(*QUANTITIES, "rate_hz")
+    arrays = {name: _array(entry.part(name), QUANTITIES[name]) for name in QUANTITIES if name in entry.found}
+    rate = entry.found.get("rate_hz")
+    if not {"frames", "depth_mm", "deformation_mm"} & arrays.keys():
+        raise ImportSourceError(f"{entry.name} has no frames, depth_mm or deformation_mm: needs one of them; add it")
+    if "host_time_ns" in arrays and rate is None:
+        return StreamMap(arrays=arrays, rate_hz=None)
+    stated = isinstance(rate, (int, float)) and not isinstance(rate, bool) and 0 < rate < 1e6
+    if "host_time_ns" in arrays or rate is None or not stated:
+        raise ImportSourceError(
+            f"{entry.name}: rate_hz is {rate!r}: must be above 0 where no host_time_ns is named, and absent otherwise; "
+            "give one of them"
+        )
+    return StreamMap(arrays=arrays, rate_hz=float(rate))
+
+
+def _array(entry: _Entry, quantity: Quantity, *, timed: bool = True) -> ArrayMap:
+    entry.know("path", "unit", "axes", "components", "rows", "encoded", "optional", *(("time",) if timed else ()))
+    units, encoded = UNITS[quantity.kind], entry.switch("encoded")
+    unit = entry.choice("unit", "" if quantity.kind == "picture" else None, units)
+    usual = "N" if encoded else quantity.axes
+    axes = entry.text("axes", usual)
+    grey = quantity.kind == "picture" and sorted(axes) == sorted("NHW")
+    if sorted(axes) != sorted(usual) and not grey:
+        raise ImportSourceError(f"{entry.name}: axes is {axes!r}: must be {usual} in some order; correct it")
+    rows = None
+    if "rows" in entry.found:
+        kind, path = entry.part("rows").one_of("lengths", "offsets")
+        rows = RowsMap(path=entry.part("rows").text(kind, path), kind=kind)
+    time = _array(entry.part("time"), QUANTITIES["host_time_ns"], timed=False) if "time" in entry.found else None
+    return ArrayMap(
+        path=entry.text("path"),
+        unit=unit,
+        factor=units[unit],
+        axes=axes,
+        components=_components(entry, quantity),
+        rows=rows,
+        time=time,
+        encoded=encoded,
+        optional=entry.switch("optional"),
+    )
+
+
+def _components(entry: _Entry, quantity: Quantity) -> tuple[str, ...]:
+    given = entry.found.get("components", list(quantity.components))
+    if not isinstance(given, list) or not all(isinstance(one, str) or one is None for one in given):
+        raise ImportSourceError(f"{entry.name}: components is {given!r:.60}: must be a list of names; correct it")
+    named = [one for one in given if one is not None]
+    if sorted(one.removeprefix("-") for one in named) != sorted(quantity.components):
+        listed = ", ".join(quantity.components) or "nothing"
+        raise ImportSourceError(
+            f"{entry.name}: components is {given!r:.60}: must name {listed} once each, and null for others; correct it"
+        )
+    if quantity.kind == "picture" and any(one.startswith("-") for one in named):
+        raise ImportSourceError(f"{entry.name}: components is {given!r:.60}: colours have no sign; drop the '-'")
+    return tuple(one or "" for one in given)

@@ -1,0 +1,314 @@
+"""Arrays of one contact in an HDF5 file, brought to the schema."""
+
+import contextlib
+import dataclasses
+import pathlib
+from collections.abc import Iterator
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from sensors_io.importers.catalogue import Taken
+from sensors_io.importers.hdf5_map import QUANTITIES, UNITS, ArrayMap, LayoutMap, RowsMap, StreamMap
+from sensors_io.importers.keep import ImportSourceError, Keep, Skip, UnreadableError
+from sensors_io.importers.pictures import decode_picture, film, nominal_ns
+from sensors_io.schema import ContactKey, Flag, SchemaError, Sequence
+
+STATED = ("unit", "units")
+"""Attributes of a data set that state its unit."""
+
+SPELLED = {
+    "meter": "m", "meters": "m", "metre": "m", "metres": "m", "millimeter": "mm", "millimeters": "mm",
+    "millimetre": "mm", "millimetres": "mm", "µm": "um", "micrometer": "um", "micrometers": "um", "newton": "N",
+    "newtons": "N", "n": "N", "nm": "N m", "n*m": "N m", "nmm": "N mm", "second": "s", "seconds": "s", "sec": "s",
+    "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns",
+}  # fmt: skip
+"""Other spellings of units, in lower case."""
+
+LATE = 1.5
+"""Median periods between two frames from which on one is taken to be missing."""
+
+
+class HDF5Error(UnreadableError):
+    """A file, group or data set that does not hold what the mapping says; the message names it."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Place:
+    """One contact: its file, its group, and its number among those whose rows the arrays hold one after the other."""
+
+    file: pathlib.Path
+    group: str
+    row: int
+
+    @property
+    def name(self) -> str:
+        """For reports."""
+        return f"{self.file.name}{'' if self.group == '/' else self.group}" + (f", row {self.row}" if self.row else "")
+
+
+def h5py() -> ModuleType:
+    """The library that reads HDF5.
+
+    Raises:
+      ImportSourceError: it is not installed.
+    """
+    try:
+        import h5py as library
+    except ImportError as error:
+        raise ImportSourceError("h5py is not installed: HDF5 needs it; pip install 'touchr1-jax[hdf5]'") from error
+    return library
+
+
+@contextlib.contextmanager
+def opened(path: pathlib.Path) -> Iterator[Any]:
+    """An HDF5 file, closed at the end.
+
+    Raises:
+      HDF5Error: it, or what is read of it, is damaged.
+    """
+    library = h5py()
+    try:
+        with library.File(path, "r") as file:
+            yield file
+    except (OSError, RuntimeError, KeyError) as error:  # h5py raises all three for damaged or cut files
+        raise HDF5Error(f"cannot be read: {str(error).strip(chr(39))}") from error
+
+
+def bounds(file: Any, group: str, rows: RowsMap) -> np.ndarray:
+    """First row of each contact in arrays that hold the rows of all, and their end, int64 [contacts + 1].
+
+    Raises:
+      HDF5Error: they are no ascending whole numbers.
+    """
+    found = dataset(file, group, rows.path, rows.kind)[()]
+    ends = np.append(0, np.cumsum(found)) if rows.kind == "lengths" else np.asarray(found)
+    whole = np.issubdtype(ends.dtype, np.integer) and ends.ndim == 1 and len(ends) > 1
+    if not whole or ends[0] < 0 or (np.diff(ends.astype(np.int64)) < 0).any():
+        must = (
+            "lengths of all contacts" if rows.kind == "lengths" else "first rows of all contacts and the last one's end"
+        )
+        raise HDF5Error(f"{rows.path} must hold the {must}, whole numbers ≥ 0, the rows ascending")
+    return ends.astype(np.int64)
+
+
+def dataset(file: Any, group: str, path: str, what: str) -> Any:
+    """A data set by its path, which is relative to a group unless it begins with "/".
+
+    Raises:
+      HDF5Error: there is none; the message says for `what` it is wanted.
+    """
+    found = file.get(path if path.startswith("/") else f"{group.rstrip('/')}/{path}")
+    if not isinstance(found, h5py().Dataset):
+        raise HDF5Error(f"lacks {path}, which the mapping names for {what}")
+    return found
+
+
+def read_contact(place: Place, key: ContactKey, layout: LayoutMap, keep: Keep) -> Taken:
+    """Read a contact: a sequence of every sensor that has data there.
+
+    Raises:
+      HDF5Error: what is read is missing, damaged or beyond what a sensor gives.
+    """
+    sequences, left_out = [], []
+    with opened(place.file) as file:
+        for sensor, stream in layout.sensors.items():
+            present = {n for n, array in stream.arrays.items() if _has(file, place.group, array.path)}
+            if not present:
+                left_out.append(Skip(name=f"{place.name}, {sensor}", reason="has no data here"))
+                continue
+            lacking = [name for name in stream.arrays if name not in present]
+            for name in lacking:
+                if not stream.arrays[name].optional:
+                    dataset(file, place.group, stream.arrays[name].path, f"{name} of {sensor}")
+                left_out.append(Skip(name=f"{place.name}, {sensor}", reason=f"lacks {name}"))
+            arrays = {name: stream.arrays[name] for name in stream.arrays if name in present}
+            try:
+                sequence, lost = _sequence(file, place, key, sensor, dataclasses.replace(stream, arrays=arrays), keep)
+            except SchemaError as error:
+                raise HDF5Error(str(error)) from error
+            sequences.append(sequence)
+            left_out += lost
+    if not sequences:
+        raise HDF5Error("holds no data of any sensor")
+    return Taken(sequences=tuple(sequences), left_out=tuple(left_out))
+
+
+def _has(file: Any, group: str, path: str) -> bool:
+    return (path if path.startswith("/") else f"{group.rstrip('/')}/{path}") in file
+
+
+def _sequence(
+    file: Any, place: Place, key: ContactKey, sensor: str, stream: StreamMap, keep: Keep
+) -> tuple[Sequence, list[Skip]]:
+    """One sensor's sequence and the frames that were left out."""
+    own = {name: array for name, array in stream.arrays.items() if array.time is None}
+    sources = {name: _Rows(file, place, array, f"{name} of {sensor}") for name, array in own.items()}
+    counts = {name: len(rows) for name, rows in sources.items()}
+    if len(set(counts.values())) > 1:
+        listed = ", ".join(f"{name} has {count}" for name, count in counts.items())
+        raise HDF5Error(f"{sensor}: {listed} frames: must be as many, or state the `time` of the other clock")
+    count = next(iter(counts.values()), 0)
+    if not count:
+        raise HDF5Error(f"{sensor} holds no frame")
+    if "host_time_ns" in sources:
+        times_ns = sources["host_time_ns"].times_ns(np.arange(count))
+    else:
+        assert stream.rate_hz is not None
+        times_ns = nominal_ns(np.arange(count), stream.rate_hz)
+    periods = np.diff(times_ns, prepend=times_ns[:1])
+    late = np.cumsum(periods > LATE * np.median(periods[1:])) if count > 1 else np.zeros(1, np.int64)
+    positions = keep.positions(count)
+    values: dict[str, np.ndarray] = {}
+    for name, rows in sources.items():
+        if name == "device_time_ns":
+            values[name] = rows.times_ns(positions)
+        elif name != "host_time_ns":
+            values[name] = rows.pictures(positions, keep) if name == "frames" else rows.values(name, positions)
+    outside = np.zeros(len(positions), np.bool_)
+    for name in stream.arrays.keys() - own.keys():
+        values[name], beyond = _resampled(file, place, stream.arrays[name], name, sensor, times_ns[positions])
+        outside |= beyond
+    finite = np.all([np.isfinite(v).reshape(len(positions), -1).all(1) for v in values.values()], axis=0)
+    if not finite.any():
+        raise HDF5Error(f"{sensor} holds no frame of finite values")
+    name = f"{place.name}, {sensor}"
+    lost = [Skip(name=f"{name}, frame {n}", reason="holds values that are not finite") for n in positions[~finite]]
+    kept = positions[finite]
+    sequence = film(
+        key,
+        sensor,
+        gap=np.diff(late[kept], prepend=late[kept][:1]) > 0,
+        host_time_ns=times_ns[kept],
+        camera={"file": place.file.name, "group": place.group},
+        **{name: value[finite] for name, value in values.items()},
+    )
+    flags = sequence.flags | np.where(outside[finite], np.uint32(Flag.INCOMPLETE), np.uint32(0))
+    return dataclasses.replace(sequence, flags=flags), lost
+
+
+def _resampled(
+    file: Any, place: Place, array: ArrayMap, name: str, sensor: str, times_ns: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """An array of another clock at the times of the frames, and which frames lie outside of its time."""
+    assert array.time is not None
+    rows = _Rows(file, place, array, f"{name} of {sensor}")
+    clock = _Rows(file, place, array.time, f"time of {name} of {sensor}")
+    if len(rows) != len(clock) or not len(rows):
+        raise HDF5Error(f"{name} of {sensor} has {len(rows)} rows and {len(clock)} times: must be as many, and some")
+    every = np.arange(len(rows))
+    own_ns, values = clock.times_ns(every), rows.values(name, every)
+    seconds = lambda ns: (ns - own_ns[0]).astype(np.float64)
+    flat = values.reshape(len(values), -1)
+    columns = [np.interp(seconds(times_ns), seconds(own_ns), column) for column in flat.T]
+    found = np.stack(columns, -1).reshape(len(times_ns), *values.shape[1:]).astype(np.float32)
+    return found, (times_ns < own_ns[0]) | (times_ns > own_ns[-1])
+
+
+class _Rows:
+    """The rows of one contact in one data set."""
+
+    def __init__(self, file: Any, place: Place, array: ArrayMap, what: str) -> None:
+        self.array, self.what = array, what
+        self.data = dataset(file, place.group, array.path, what)
+        axes = 1 + (self.data.ndim == 2) if array.encoded else len(array.axes)  # files of one length, padded
+        if self.data.ndim != axes:
+            raise HDF5Error(f"{array.path} for {what} has shape {self.data.shape}: must have axes {array.axes}")
+        self.axis = array.axes.index("N")
+        if array.rows is None:
+            self.first, self.end = 0, self.data.shape[self.axis]
+        else:
+            self.first, self.end = bounds(file, place.group, array.rows)[place.row : place.row + 2].tolist()
+        if self.end > self.data.shape[self.axis]:
+            raise HDF5Error(f"{array.path} for {what} has {self.data.shape[self.axis]} rows: {self.end} are stated")
+        self._require_unit()
+
+    def __len__(self) -> int:
+        return self.end - self.first
+
+    def _require_unit(self) -> None:
+        """Compare the unit that the data set states with the mapping's."""
+        array = self.array
+        units = next(known for known in UNITS.values() if array.unit in known and known[array.unit] == array.factor)
+        for name in STATED:
+            said = self.data.attrs.get(name, "")
+            said = said.decode(errors="replace") if isinstance(said, bytes) else str(said)
+            unit = SPELLED.get(said.strip().lower(), said.strip())
+            if unit in units and units[unit] != array.factor:
+                raise HDF5Error(f"{array.path} states the unit {said!r}, the mapping {array.unit!r} for {self.what}")
+
+    def _raw(self, positions: np.ndarray) -> np.ndarray:
+        """Some rows, the axes in the order of the schema."""
+        index: list[Any] = [slice(None)] * self.data.ndim
+        index[self.axis] = (self.first + positions).tolist()
+        found = np.asarray(self.data[tuple(index)])
+        if self.array.encoded:
+            return found
+        order = [self.array.axes.index(axis) for axis in "NHWC" if axis in self.array.axes]
+        found = found.transpose(order)
+        if found.dtype.kind not in "fiu":
+            raise HDF5Error(f"{self.array.path} for {self.what} holds {found.dtype}: must hold numbers")
+        if "C" not in self.array.axes:
+            return found
+        if found.shape[-1] != len(self.array.components):
+            raise HDF5Error(
+                f"{self.array.path} for {self.what} has {found.shape[-1]} components: must have "
+                f"{', '.join(self.array.components)}"
+            )
+        return found
+
+    def values(self, name: str, positions: np.ndarray) -> np.ndarray:
+        """Numbers in the unit, the signs and the order of components of the schema, float32.
+
+        Raises:
+          HDF5Error: no tactile sensor gives such values.
+        """
+        quantity, found = QUANTITIES[name], self._raw(positions).astype(np.float64) * self.array.factor
+        if quantity.components:
+            signs = [-1.0 if c.startswith("-") else 1.0 for c in self.array.components]
+            plain = [c.removeprefix("-") for c in self.array.components]
+            found = (found * signs)[..., [plain.index(c) for c in quantity.components]]
+        greatest = float(np.max(np.abs(found), where=np.isfinite(found), initial=0.0))
+        if greatest > quantity.most or 0 < greatest < quantity.least:
+            bound = f"at most {quantity.most:g}" if greatest > quantity.most else f"at least {quantity.least:g}"
+            raise HDF5Error(
+                f"{self.array.path} reaches {greatest:.3g} as {name}: a sensor gives {bound}; is the unit "
+                f"{self.array.unit!r}?"
+            )
+        return found.astype(np.float32)
+
+    def times_ns(self, positions: np.ndarray) -> np.ndarray:
+        """Times, int64, ascending.
+
+        Raises:
+          HDF5Error: they are not finite, or run backwards.
+        """
+        found, factor = self._raw(positions), self.array.factor
+        if np.issubdtype(found.dtype, np.integer):
+            found = found.astype(np.int64) * int(factor)
+        else:
+            if not np.isfinite(found).all() or np.abs(found * factor).max(initial=0) >= 2**63:
+                raise HDF5Error(f"{self.array.path} for {self.what} holds times that are not finite")
+            found = np.rint(found.astype(np.float64) * factor).astype(np.int64)
+        if (np.diff(found) < 0).any():
+            raise HDF5Error(f"{self.array.path} for {self.what} runs backwards")
+        return found
+
+    def pictures(self, positions: np.ndarray, keep: Keep) -> np.ndarray:
+        """Pictures, uint8 [N, H, W, 3], RGB, at `keep.height` rows."""
+        raw = self._raw(positions)
+        if self.array.encoded:
+            rows = [np.asarray(row, np.uint8).tobytes().rstrip(b"\0") for row in raw]
+            return np.stack([keep.shrink(decode_picture(row)) for row in rows])
+        if self.array.factor != 1:
+            if not (np.isfinite(raw).all() and raw.min() >= 0 and raw.max() <= 1):
+                raise HDF5Error(f"{self.array.path} for {self.what} must lie in 0..1 by its unit '1'")
+            raw = np.rint(raw * self.array.factor).astype(np.uint8)
+        if raw.dtype != np.uint8:
+            raise HDF5Error(f"{self.array.path} for {self.what} holds {raw.dtype}: must hold uint8, or unit '1'")
+        if "C" not in self.array.axes:
+            raw = np.repeat(raw[..., None], 3, -1)
+        else:
+            raw = raw[..., [self.array.components.index(c) for c in QUANTITIES["frames"].components]]
+        return np.stack([keep.shrink(np.ascontiguousarray(frame)) for frame in raw])

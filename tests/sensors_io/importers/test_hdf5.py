@@ -1,0 +1,244 @@
+"""HDF5 files of four layouts become records whose arrays equal those that h5py reads."""
+
+import json
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+from sensors_io.__main__ import main
+from sensors_io.importers.catalogue import import_catalogue
+from sensors_io.importers.hdf5 import HDF5Config, list_hdf5
+from sensors_io.importers.hdf5_inspect import UNKNOWN_UNIT, propose
+from sensors_io.importers.hdf5_map import read_map
+from sensors_io.importers.keep import ImportSourceError
+from sensors_io.records import RecordStore
+from sensors_io.schema import Flag
+
+RNG = np.random.default_rng(0)
+RGB = RNG.integers(0, 256, (6, 8, 10, 3), np.uint8)
+DEPTH_M = RNG.uniform(0, 2e-3, (6, 5, 4))
+FORCE = RNG.normal(0, 4, (12, 3))
+TIME_S, FORCE_TIME_S = 100 + np.arange(6) / 30, 100 + np.arange(12) / 60
+WHOLE = {"height": 0, "max_frames": 0, "val_share": 0.0, "test_share": 0.0}
+
+
+def trial(group, *, at=0.0):
+    """A contact as most laboratories write it: a group of a camera and one of a force sensor twice as fast."""
+    group["mini/rgb"] = RGB
+    group["mini/time"] = TIME_S + at
+    group["mini/depth"] = DEPTH_M
+    group["mini/depth"].attrs["unit"] = "m"
+    group["ft/force"] = FORCE
+    group["ft/time"] = FORCE_TIME_S + at
+
+
+def mapped(**changes):
+    """The mapping of `trial` in /trials; an array of `changes` that is `None` is left out."""
+    mini = {
+        "frames": {"path": "mini/rgb"},
+        "host_time_ns": {"path": "mini/time", "unit": "s"},
+        "depth_mm": {"path": "mini/depth", "unit": "m"},
+        "force_n": {"path": "ft/force", "unit": "N", "time": {"path": "ft/time", "unit": "s"}},
+    } | changes.pop("mini", {})
+    mini = {name: array for name, array in mini.items() if array is not None}
+    return {"contact": "/trials/*", "sensors": {"gelsight_mini": mini}, **changes}
+
+
+def write_map(folder, layout):
+    path = folder / "map.json"
+    path.write_text(json.dumps(layout))
+    return path
+
+
+def imported(folder, layout, **config):
+    """Sequences and report of an import."""
+    catalogue = list_hdf5(folder, HDF5Config(map=write_map(folder, layout), **WHOLE | config))
+    report = import_catalogue(catalogue, folder / "records")
+    store = RecordStore(folder / "records")
+    return [tuple(store.contact(i).values()) for i in range(len(store))], report
+
+
+def test_groups_by_trial_with_force_of_another_rate(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for n, name in enumerate(("mug", "cup", "mug")):
+            trial(file.create_group(f"trials/trial_{n}"), at=float(n))
+            file[f"trials/trial_{n}"].attrs["object"] = name
+            file[f"trials/trial_{n}"].attrs["hardness"] = 2
+    values = {"object_id": {"attribute": "object"}, "labels": {"hardness": {"attribute": "hardness"}}}
+    contacts, report = imported(tmp_path, mapped(**values))
+    assert (report.contacts, report.objects["train"], report.skipped) == (3, 2, ())
+    for contact in contacts:
+        (sequence,) = contact
+        np.testing.assert_array_equal(sequence.frames, RGB)
+        np.testing.assert_allclose(sequence.depth_mm, 1e3 * DEPTH_M, atol=5e-4)  # the records' scale
+        np.testing.assert_allclose(sequence.force_n, FORCE[::2], atol=1e-3)
+        assert (np.diff(sequence.host_time_ns) - 1e9 / 30 < 300).all()  # float64 seconds have steps of some ns here
+        assert not sequence.flags.any()
+    assert {contact[0].key.object_id for contact in contacts} == {"mug", "cup"}
+
+
+def test_ragged_rows_of_compressed_arrays(tmp_path):
+    lengths = [2, 3, 1]
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
+        file.create_dataset("rgb", data=RGB.transpose(0, 3, 1, 2), compression="gzip", chunks=(1, 3, 8, 10))
+        file.create_dataset("depth", data=1e6 * DEPTH_M.transpose(1, 2, 0), compression="lzf")
+        file["lengths"], file["name"] = lengths, [b"mug", b"cup", b"jar"]
+    rows = {"rows": {"lengths": "/lengths"}}
+    arrays = {
+        "frames": {"path": "rgb", "axes": "NCHW", "components": ["b", "g", "r"], **rows},
+        "depth_mm": {"path": "depth", "unit": "um", "axes": "HWN", **rows},
+        "rate_hz": 50,
+    }
+    layout = {"sensors": {"digit": arrays}, "object_id": {"path": "name"}}
+    contacts, report = imported(tmp_path, layout)
+    assert report.contacts == 3
+    first = 0
+    for (sequence,), length, name in zip(contacts, lengths, ("mug", "cup", "jar"), strict=True):
+        assert sequence.key.object_id == name
+        np.testing.assert_array_equal(sequence.frames, RGB[first : first + length, ..., ::-1])
+        np.testing.assert_allclose(sequence.depth_mm, 1e3 * DEPTH_M[first : first + length], atol=5e-4)
+        np.testing.assert_array_equal(sequence.host_time_ns, 20_000_000 * np.arange(length))
+        first += length
+    layout["sensors"]["digit"]["frames"]["rows"] = {"offsets": "/offsets"}
+    with h5py.File(tmp_path / "a.hdf5", "a") as file:
+        file["offsets"] = [0, 2, 5, 7]
+    assert "7 are stated" in " ".join(skip.reason for skip in imported_anew(tmp_path, layout).skipped)
+
+
+def imported_anew(folder, layout):
+    catalogue = list_hdf5(folder, HDF5Config(map=write_map(folder, layout), **WHOLE))
+    return import_catalogue(catalogue, folder / "again")
+
+
+def test_a_file_for_each_contact_and_pictures_as_png(tmp_path):
+    for n in range(2):
+        with h5py.File(tmp_path / f"press_{n}.h5", "w") as file:
+            rows = file.create_dataset("left/image", (6,), h5py.vlen_dtype(np.uint8))
+            for i, frame in enumerate(RGB):
+                rows[i] = cv2.imencode(".png", frame[..., ::-1])[1].ravel()
+            file["wrench"] = np.concatenate([FORCE[::2], 7 + FORCE[::2]], -1)
+    components = ["x", "-y", "z", None, None, None]
+    arrays = {
+        "frames": {"path": "left/image", "encoded": True},
+        "force_n": {"path": "wrench", "unit": "N", "components": components},
+        "rate_hz": 30.0,
+    }
+    contacts, _ = imported(tmp_path, {"motion": {"value": "press"}, "sensors": {"xense": arrays}})
+    assert [contact[0].key.object_id for contact in contacts] == ["press_0.h5", "press_1.h5"]
+    np.testing.assert_array_equal(contacts[1][0].frames, RGB)
+    np.testing.assert_allclose(contacts[1][0].force_n, FORCE[::2] * (1, -1, 1), atol=1e-3)
+
+
+def test_several_sensors_of_different_rates(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        group = file.create_group("trials/0")
+        trial(group)
+        group["tac3d/disp"] = np.full((30, 4, 4, 2), 0.25)
+        group["tac3d/stamp"] = (1e6 * (100 + np.arange(30) / 100)).astype(np.int64)
+    layout = mapped()
+    layout["sensors"]["tac3d"] = {
+        "deformation_mm": {"path": "tac3d/disp", "unit": "mm"},
+        "host_time_ns": {"path": "tac3d/stamp", "unit": "us"},
+        "force_n": {"path": "ft/force", "unit": "N", "time": {"path": "ft/time", "unit": "s"}},
+    }
+    ((mini, tac3d),), _ = imported(tmp_path, layout)
+    assert (len(mini), len(tac3d)) == (6, 30)
+    np.testing.assert_array_equal(np.diff(tac3d.host_time_ns), 10_000_000)
+    after = (tac3d.host_time_ns - tac3d.host_time_ns[0]) / 1e9 > 11 / 60 + 1e-6  # the force sensor had stopped
+    np.testing.assert_array_equal(tac3d.flags != 0, after)
+    assert set(tac3d.flags[after].tolist()) == {int(Flag.INCOMPLETE)}
+    expected = [np.interp(np.arange(30) / 100, np.arange(12) / 60, FORCE[:, c]) for c in range(3)]
+    np.testing.assert_allclose(tac3d.force_n, np.transpose(expected), atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "entry", "good", "bad", "said"),
+    [
+        ("shear_mm", {"unit": "mm"}, np.ones((6, 5, 4, 2)), np.full((6, 5, 4, 2), 2e3), "reaches 2e+03 as shear_mm"),
+        ("shear_mm", {"unit": "m"}, np.full((6, 5, 4, 2), 1e-3), np.ones((6, 5, 4, 2)), "a sensor gives at most 20"),
+        ("depth_mm", {"unit": "mm"}, np.ones((6, 5, 4)), 1e-6 * DEPTH_M, "a sensor gives at least 0.001"),
+        ("depth_mm", {"unit": "mm"}, np.ones((6, 5, 4)), np.full((6, 5, 4), np.nan), "no frame of finite values"),
+        ("force_n", {"unit": "N"}, FORCE[:6], None, "lacks x, which the mapping names for force_n"),
+        ("force_n", {"unit": "N"}, FORCE[:6], FORCE, "force_n has 12"),
+        ("force_n", {"unit": "N"}, FORCE[:6], FORCE[:6, :2], "has 2 components: must have x, y, z"),
+        ("frames", {}, RGB, RGB[..., 0], "has shape (6, 8, 10): must have axes NHWC"),
+        ("frames", {}, RGB, RGB.astype(np.float32), "holds float32: must hold uint8"),
+        ("shear_mm", {"unit": "mm"}, np.ones((6, 5, 4, 2)), np.ones((6, 3, 3, 2)), "dimension h must be"),
+        ("host_time_ns", {"unit": "s"}, TIME_S, TIME_S[::-1], "runs backwards"),
+        ("host_time_ns", {"unit": "s"}, TIME_S, np.full(6, np.inf), "times that are not finite"),
+    ],
+)
+def test_a_contact_that_does_not_fit_is_left_out_by_name(tmp_path, name, entry, good, bad, said):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for n, array in enumerate((good, bad)):
+            trial(file.create_group(f"trials/{n}"))
+            if array is not None:
+                file[f"trials/{n}/x"] = array
+    contacts, report = imported(tmp_path, mapped(mini={name: {"path": "x", **entry}}))
+    assert len(contacts) == 1
+    assert any(skip.name == "a.h5/trials/1" and said in skip.reason for skip in report.skipped), report.skipped
+
+
+def test_a_unit_that_the_file_contradicts_is_refused(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        trial(file.create_group("trials/0"))
+    with pytest.raises(ImportSourceError, match=r"states the unit 'm', the mapping 'mm' for depth_mm"):
+        imported(tmp_path, mapped(mini={"depth_mm": {"path": "mini/depth", "unit": "mm"}}))
+
+
+def test_an_optional_array_may_be_missing_and_a_cut_file_is_named(tmp_path):
+    for name in ("a.h5", "cut.h5"):
+        with h5py.File(tmp_path / name, "w") as file:
+            trial(file.create_group("trials/0"))
+            del file["trials/0/ft"]
+    data = (tmp_path / "cut.h5").read_bytes()
+    (tmp_path / "cut.h5").write_bytes(data[: len(data) // 2])
+    force = {"path": "ft/force", "unit": "N", "time": {"path": "ft/time", "unit": "s"}, "optional": True}
+    (((sequence,),), report) = imported(tmp_path, mapped(mini={"force_n": force}))
+    assert sequence.force_n is None
+    reasons = {skip.name: skip.reason for skip in report.skipped}
+    assert "cannot be read" in reasons["cut.h5"]
+    assert reasons["a.h5/trials/0, gelsight_mini"] == "lacks force_n"
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"sensors": {}}, "sensors is empty"),
+        ({"colour": 1}, "'colour' must be one of source"),
+        ({"mini": {"depth_mm": {"path": "d", "unit": "inch"}}}, "unit is 'inch': must be one of 'm', 'cm'"),
+        ({"mini": {"depth_mm": {"path": "d", "unit": "m", "axes": "NCHW"}}}, "axes is 'NCHW': must be NHW"),
+        ({"mini": {"force_n": {"path": "f", "unit": "N", "components": ["x", "x", "z"]}}}, "must name x, y, z once"),
+        ({"mini": {"frames": {"path": "f", "components": ["-r", "g", "b"]}}}, "colours have no sign"),
+        ({"mini": {"host_time_ns": None}}, "rate_hz is None"),
+        ({"mini": {"frames": None, "depth_mm": None}}, "needs one of them"),
+        ({"object_id": {"attribute": "a", "path": "b"}}, "must hold one of attribute, path, value"),
+        ({"mini": {"frames": {"path": 3}}}, "path is 3: must be a text"),
+    ],
+)
+def test_a_mapping_that_does_not_fit_is_refused_by_name(tmp_path, change, said):
+    with pytest.raises(ImportSourceError, match=said.replace("(", r"\(")):
+        read_map(write_map(tmp_path, mapped(**change)))
+
+
+def test_a_proposal_needs_units_and_then_imports(tmp_path, capsys):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for n in range(3):
+            trial(file.create_group(f"trials/{n}"))
+    assert main(["import", "hdf5", str(tmp_path), "--inspect"]) == 0
+    shown = capsys.readouterr().out
+    assert "rgb  uint8[6, 8, 10, 3]" in shown
+    assert "… and 2 groups of the same contents" in shown
+    layout = propose(tmp_path / "a.h5")
+    assert layout["contact"] == "/trials/*"
+    assert layout["sensors"]["mini"]["depth_mm"] == {"path": "mini/depth", "unit": "m"}  # stated by the file
+    with pytest.raises(ImportSourceError, match=r"unit is '\?'"):
+        read_map(write_map(tmp_path, layout))
+    path = write_map(tmp_path, json.loads(json.dumps(layout).replace(f'"unit": "{UNKNOWN_UNIT}"', '"unit": "s"')))
+    whole = json.loads(path.read_text())
+    whole["sensors"]["mini"]["force_n"]["unit"] = "N"
+    write_map(tmp_path, whole)
+    assert main(["import", "hdf5", str(tmp_path), "--map", str(path), "--out", str(tmp_path / "records")]) == 0
+    assert len(RecordStore(tmp_path / "records")) == 3
