@@ -122,8 +122,7 @@ def test_options_that_contradict_an_objective_are_refused(contacts):
         DynamicsConfig(encoder=dataclasses.replace(ENCODER, causal=False))
     with pytest.raises(ValueError, match="frames_kept"):
         DynamicsConfig(encoder=ENCODER, objective="masked", frames_kept=2)
-    config = DynamicsConfig(encoder=ENCODER, objective="physics")
+    config, sgd = DynamicsConfig(encoder=ENCODER, objective="physics"), optax.sgd(0.1)
+    begin = lambda: start_dynamics(config, sgd, jax.random.key(0), contacts)
     with pytest.raises(ValueError, match="depth_mm"):
-        make_dynamics_step(config, optax.sgd(0.1))(
-            start_dynamics(config, optax.sgd(0.1), jax.random.key(0), contacts), contacts.touch
-        )
+        jax.eval_shape(lambda: make_dynamics_step(config, sgd)(begin(), contacts.touch))

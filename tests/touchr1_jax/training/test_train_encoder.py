@@ -1,6 +1,7 @@
 """The encoders learn levels by a linear head; what they never see cannot count."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -48,10 +49,15 @@ def contacts(n: int = 24):
     return batch.replace(frames=frames, label=label)
 
 
+@functools.cache
+def initial():
+    """Parameters of `POLICY`."""
+    return jax.jit(functools.partial(POLICY.init, 0))(jax.tree.map(lambda x: x[:1], contacts(1)))
+
+
 def test_the_encoders_learn_and_the_decoder_stays():
-    batch = contacts()
-    touch = touch_statistics(POLICY.model.tactile, [batch])
-    params = POLICY.init(0, jax.tree.map(lambda x: x[:1], batch))
+    touch = touch_statistics(POLICY.model.tactile, [contacts()])
+    params = initial()
     lines = []
     feed = touch_rows(touch, np.arange(24), batch_size=8, seed=0)
     found = train_encoder(POLICY, params, feed, CONFIG, Hooks(log=lambda t, metrics: lines.append(metrics)))
@@ -66,10 +72,8 @@ def test_statistics_that_were_computed_before_give_the_same_features():
     batch = contacts(2).replace(
         frame_mask=np.arange(tiny.FRAMES) < np.array([4, 2])[:, None, None] + np.zeros((2, 2, 1))
     )
-    params = POLICY.init(0, batch)
-    pixels, computed = (
-        POLICY.fns.encode(params, jax.device_put(b)) for b in (batch, touch_statistics(MODEL.tactile, [batch]))
-    )
+    encode = jax.jit(POLICY.fns.encode)
+    pixels, computed = (encode(initial(), b) for b in (batch, touch_statistics(MODEL.tactile, [batch])))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-3), pixels, computed)
 
 
@@ -98,9 +102,9 @@ def test_tokens_of_touch_count_alike_and_the_more_the_surer():
 
 def test_the_gradient_of_micro_batches_is_that_of_the_batch():
     touch = jax.device_put(touch_statistics(POLICY.model.tactile, [contacts()]))
-    params = POLICY.init(0, jax.tree.map(lambda x: x[:1], contacts()))
+    params = dict(initial())
     kept = {"decoder": params.pop("decoder")}
-    width = read_tokens(POLICY.fns.encode(kept | params, touch)).shape[-1]
+    width = jax.eval_shape(lambda: read_tokens(POLICY.fns.encode(initial(), touch))).shape[-1]
     rng = np.random.default_rng(0)
     head = {"kernel": jnp.asarray(rng.normal(size=(width, 36)), jnp.float32), "bias": jnp.zeros(36)}
     trained = {"encoders": params, "head": head}
@@ -111,7 +115,7 @@ def test_the_gradient_of_micro_batches_is_that_of_the_batch():
         features = POLICY.fns.encode(kept | trained["encoders"], touch).replace(stream_mask=shown)
         return label_loss(head_log_probs(POLICY.levels, trained["head"], features), touch.label)
 
-    value, gradient = jax.value_and_grad(whole)(trained)
+    value, gradient = jax.jit(jax.value_and_grad(whole))(trained)
     state = FineTuneState(params=trained, opt_state=optimizer.init(trained), step=jnp.zeros((), jnp.int32))
     metrics = step(jax.tree.map(jnp.copy, state), touch, kept)[1]
     np.testing.assert_allclose(metrics["loss"], value, rtol=1e-5)
@@ -135,7 +139,6 @@ def test_a_stem_that_reads_whole_frames_drops_no_patch():
 def test_every_parameter_has_a_place_on_a_mesh():
     """Of what is trained and of its optimizer's state; the head once had a bias that no rule fitted."""
     batch = contacts(8)
-    params = POLICY.init(0, jax.tree.map(lambda x: x[:1], batch))
     placed = []
 
     class OnMesh(SingleDevice):
@@ -146,5 +149,5 @@ def test_every_parameter_has_a_place_on_a_mesh():
             return super().shard(step, state, batches, rows, *shared)
 
     feed = touch_rows(touch_statistics(POLICY.model.tactile, [batch]), np.arange(8), batch_size=8, seed=0)
-    train_encoder(POLICY, params, feed, EncoderTrainingConfig(steps=1, batch_size=8), Hooks(devices=OnMesh()))
+    train_encoder(POLICY, initial(), feed, EncoderTrainingConfig(steps=1, batch_size=8), Hooks(devices=OnMesh()))
     assert placed[0].params["head"]["kernel"].spec[0] == "fsdp"
