@@ -118,7 +118,7 @@ class _Loop(NamedTuple):
     t: Int[Array, ""]
     logits: Float[Array, "P G V"]
     alive: Bool[Array, "P G"]
-    caches: tuple[LayerCache, ...]
+    caches: Any
     state: Int[Array, "P G"]
     tokens: Int[Array, "T P G"]
     log_prob: Float[Array, "T P G"]
@@ -147,6 +147,18 @@ def sample(
       A `Rollout` [P, G, T]; after the end token ids are `pad_id`, log-probabilities 0 and the mask false.  Under a
       constraint the log-probabilities are still those of the unconstrained policy, which is what the learner scores.
     """
+    return sample_with_caches(decode, first, prefix, empty, key, config)[0]
+
+
+def sample_with_caches(
+    decode: Callable[[Array, Array, Any, Any], tuple[Array, Any]],
+    first: Float[Array, "P V"],
+    prefix: Any,
+    empty: Any,
+    key: Array,
+    config: SampleConfig,
+) -> tuple[Rollout, Any]:
+    """As `sample`, and what the last token step left in the caches [P, G, …], of which any tree will do."""
     p, g, t_max = first.shape[0], config.group, config.length
     step = jax.vmap(jax.vmap(decode, in_axes=(0, None, None, 0)), in_axes=(0, None, 0, 0))
     ends = jnp.asarray(config.end_ids)
@@ -180,7 +192,8 @@ def sample(
     )
     end = jax.lax.while_loop(lambda s: (s.t < t_max) & any_alive(s.alive), body, start)
     by_rollout = lambda x: jnp.moveaxis(x, 0, -1)
-    return Rollout(tokens=by_rollout(end.tokens), log_prob=by_rollout(end.log_prob), mask=by_rollout(end.mask))
+    drawn = Rollout(tokens=by_rollout(end.tokens), log_prob=by_rollout(end.log_prob), mask=by_rollout(end.mask))
+    return drawn, end.caches
 
 
 @custom_vmap

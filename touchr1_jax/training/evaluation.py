@@ -1,9 +1,10 @@
 """Greedy and sampled answers of a policy to every question about some contacts, and the reward that each earns."""
 
+import collections
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -14,13 +15,25 @@ from touchr1_jax.models.policy import Features
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.rewards import make_rewards, total_reward
 from touchr1_jax.rewards.base import GROUP, Decode
-from touchr1_jax.rl.rollout import GreedyAnswers, GRPOBatch, SampleConfig, make_answer, sample_group
+from touchr1_jax.rl.rollout import (
+    GreedyAnswers,
+    GRPOBatch,
+    SampleConfig,
+    encode_prompts,
+    make_answer,
+    sample_with_caches,
+)
 from touchr1_jax.text.template import level_tokens
 from touchr1_jax.training.questions import equal_blocks, labelled_questions, question_batch
 from touchr1_jax.types import Params, Parsed
 
 EVAL_BATCH = 64
 """Questions that are answered at once."""
+
+AHEAD = 2
+"""Batches of questions that are dispatched before the first is fetched."""
+
+T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -89,10 +102,10 @@ def evaluate_policy(
     found, done = [], 0
     progress(0, len(rounds) * len(contact))
     for streams, ask in rounds:
-        blocks = []
-        for block, (rows, real) in enumerate(equal_blocks(len(contact), batch_size)):
-            batch = question_batch(policy, features, label, contact[rows], attribute[rows], streams[rows])
-            blocks.append(jax.tree.map(lambda x, n=real: np.asarray(x)[:n], ask(batch, block)))
+        order, blocks = enumerate(equal_blocks(len(contact), batch_size)), []
+        batch = lambda at, s=streams: question_batch(policy, features, label, contact[at], attribute[at], s[at])
+        for result, real in in_flight((ask(batch(rows), block), real) for block, (rows, real) in order):
+            blocks.append(jax.tree.map(lambda x, n=real: np.asarray(x)[:n], result))
             done += real
             progress(done, len(rounds) * len(contact))
         found.append(jax.tree.map(lambda *x: np.concatenate(x), *blocks))
@@ -112,6 +125,16 @@ def evaluate_policy(
     )
 
 
+def in_flight(results: Iterable[T], number: int = AHEAD) -> Iterator[T]:
+    """The results in their order, each once so many later ones are dispatched: small programs leave cores idle."""
+    waiting: collections.deque[T] = collections.deque()
+    for result in results:
+        waiting.append(result)
+        if len(waiting) > number:
+            yield waiting.popleft()
+    yield from waiting
+
+
 @functools.cache
 def answer_program(policy: TouchPolicy, *, constrained: bool = False) -> Any:
     """Compiled greedy decoder and parser, made once; a constrained one writes formatted answers alone."""
@@ -129,25 +152,29 @@ def sample_program(policy: TouchPolicy, samples: int, *, constrained: bool = Fal
     grammar = policy.constraint if constrained else None
     draw = SampleConfig(group=samples, length=length, end_ids=fns.end_ids, pad_id=fns.pad_id, constraint=grammar)
     known = level_tokens(policy.language, policy.tokenizer)
+    unknown = jnp.zeros(max(policy.levels))
 
-    def of_prompt(params: Params, batch: GRPOBatch, tokens: jax.Array, level: jax.Array) -> jax.Array:
-        a = jnp.argmax(batch.target.asked)
+    def decode(params: Params, token: jax.Array, t: jax.Array, past: Any, kept: Any) -> tuple[jax.Array, Any]:
+        """A token step that keeps p(level | trace), the softmax over the levels' scores after `conclude` opens."""
+        (prefix, ids), (caches, share) = past, kept
+        logits, caches = fns.decode(params, token, t, prefix, caches)
         if known is None:
-            share = jax.nn.one_hot(level[:, a], max(policy.levels))
-        else:
-            at = jnp.argmax(tokens == known.opens, -1) + 1
-            states = fns.group_states(params, batch.features, batch.ids, batch.mask, tokens)[0]
-            chosen = jnp.take_along_axis(states, jnp.minimum(at, length - 1)[:, None, None], 1)[:, 0]
-            ids = jnp.asarray(known.level)[a]
-            p = jax.nn.softmax(jnp.where(ids >= 0, fns.logits(params, chosen)[:, ids], -jnp.inf))
-            share = jnp.where(((at > 1) & (at < length))[:, None], p, 0.0)
-        return jnp.mean(share, 0)
+            return logits, (caches, share)
+        opened = (token == known.opens) & (t > 0) & (t < length - 1) & ~jnp.any(share)
+        p = jax.nn.softmax(jnp.where(ids >= 0, logits[ids], -jnp.inf))
+        return logits, (caches, jnp.where(opened, p, share))
 
     @jax.jit
     def sample(params: Params, batch: GRPOBatch, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        tokens = sample_group(fns, params, batch, key, draw).tokens
-        level = jax.vmap(jax.vmap(policy.parser))(tokens).conclude
-        return level, jax.vmap(of_prompt, in_axes=(None, 0, 0, 0))(params, batch, tokens, level)
+        prompts, asked = encode_prompts(fns, params, batch), jnp.argmax(batch.target.asked, -1)
+        ids = jnp.zeros_like(asked) if known is None else jnp.asarray(known.level)[asked]
+        past, kept = (prompts.prefix, ids), (fns.empty_cache(length), unknown)
+        step = functools.partial(decode, params)
+        drawn, (_, share) = sample_with_caches(step, prompts.first, past, kept, key, draw)
+        level = jax.vmap(jax.vmap(policy.parser))(drawn.tokens).conclude
+        if known is None:
+            share = jax.nn.one_hot(jnp.take_along_axis(level, asked[:, None, None], -1)[..., 0], len(unknown))
+        return level, jnp.mean(share, 1)
 
     return sample
 

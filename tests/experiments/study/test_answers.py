@@ -10,8 +10,9 @@ import pytest
 from tests.experiments import tiny
 from tests.experiments.study.test_study import answers_about
 from touchr1_jax.rewards import make_rewards, total_reward
-from touchr1_jax.rl.rollout import GreedyAnswers
-from touchr1_jax.training.evaluation import evaluate_policy, reward_terms, rewards_of
+from touchr1_jax.rl.rollout import GreedyAnswers, SampleConfig, sample_group
+from touchr1_jax.training.evaluation import evaluate_policy, in_flight, reward_terms, rewards_of, sample_program
+from touchr1_jax.training.questions import question_batch
 from touchr1_jax.types import Parsed
 
 WEIGHTS = {"accuracy_debiased": 0.6, "consistency": 0.3, "format": 0.1}
@@ -84,14 +85,29 @@ def test_sampled_answers_differ_from_each_other_and_repeat(ask):
     assert np.array_equal(one.tokens, ask(features, LABEL, alone=False).tokens)
 
 
-def test_the_marginal_is_the_mean_over_traces_of_the_levels_that_may_follow(policy, params, ask):
-    """Traces of the policy seldom conclude; those that do are scored one by one."""
-    features = tiny.features(3)
-    said = ask(features, LABEL, alone=False, samples=3)
-    assert said.marginal.shape == (12, 9)
-    assert np.all(said.marginal.sum(-1) < 1 + 1e-5)
-    levels = np.array([policy.levels[a] for a in said.attribute])
-    assert not said.marginal[np.arange(9) >= levels[:, None]].any()
+def test_the_marginal_is_the_mean_over_traces_of_the_levels_that_may_follow(policy, params):
+    """As the learner's forward pass scores them; under the grammar every trace concludes."""
+    contact, attribute = np.divmod(np.arange(8), 4)
+    batch = question_batch(policy, tiny.features(2), LABEL[:2], contact, attribute, np.ones((8, 4), bool))
+    marginal = sample_program(policy, 3, constrained=True)(params, batch, jax.random.key(1))[1]
+    fns, known, length = policy.fns, policy.level_tokens, policy.model.completion_tokens
+    draw = SampleConfig(group=3, length=length, end_ids=fns.end_ids, pad_id=fns.pad_id, constraint=policy.constraint)
+    tokens = np.asarray(sample_group(fns, params, batch, jax.random.key(1), draw).tokens)
+    logits = jax.vmap(fns.group_logits, (None, 0, 0, 0, 0))(params, batch.features, batch.ids, batch.mask, tokens)
+    for i, a in enumerate(attribute):
+        at = (tokens[i] == known.opens).argmax(-1) + 1
+        scores = np.asarray(logits)[i, np.arange(3), at][:, known.level[a, : policy.levels[a]]]
+        expected = np.asarray(jax.nn.softmax(scores)).mean(0)
+        np.testing.assert_allclose(marginal[i, : policy.levels[a]], expected, atol=1e-6)
+        assert not marginal[i, policy.levels[a] :].any()
+
+
+def test_results_are_dispatched_ahead_and_come_in_order():
+    dispatched = []
+    results = in_flight((dispatched.append(i) or i for i in range(5)), 2)
+    assert next(results) == 0
+    assert dispatched == [0, 1, 2]
+    assert [*results] == [1, 2, 3, 4]
 
 
 def felt_sum(decoder, batch):
