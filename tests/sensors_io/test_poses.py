@@ -58,13 +58,6 @@ def test_a_sensor_that_never_rests_has_no_pose():
     assert found_in(times, force + rng.normal(0, 0.2, force.shape), moment) == []
 
 
-def test_the_same_pose_held_again_is_not_another():
-    refused(ValueError, "still_n is 0", PoseConfig, still_n=0)
-    times, force, moment, _ = turned(count=1, hold_s=5)
-    assert len(found_in(times, force, moment)) == 1
-    refused(ForceError, "span no sphere", lambda: fit_poses(found_in(times, force, moment)))
-
-
 def test_a_zero_comes_back_from_its_file(tmp_path):
     zero = fit_poses(found_in(*turned()[:3]))
     path = tmp_path / "g.json"

@@ -4,7 +4,6 @@ import os
 import pathlib
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -14,7 +13,6 @@ import numpy as np
 import pytest
 
 from sensors_io import __main__ as cli
-from sensors_io.calibration.geometry import CameraGeometry
 from sensors_io.offsets import Offset, Offsets
 from sensors_io.poses import ForceZero
 from sensors_io.records import RecordStore
@@ -79,33 +77,6 @@ def test_ctrl_c_ends_a_recording_cleanly(tmp_path, press):
     assert child.wait(timeout=60) == 0
     assert len(RecordStore(out).contact(0)["tac3d"]) > 10
     assert not list(out.glob(".journals/*"))
-
-
-def test_view_extracts_fields_of_a_camera(tmp_path, capsys):
-    """Presses of a real Mini without calibration: no depth and no shear can be told, and the view says so."""
-    gelslam = ROOT / "tests" / "data" / "gelslam"
-    args = ["view", "--port", "0", "--seconds", "0.3", "--background", gelslam / "background.png", "replay"]
-    assert cli.main([*map(str, args), "--path", str(gelslam), "--seconds", "30"]) == 0
-    assert "not shown: depth_mm: without a calibration" in capsys.readouterr().out
-
-
-def test_devices_says_what_is_absent(capsys):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-    assert cli.main(["devices", "--wait-s", "0.1", "--netft-host", "127.0.0.1", "--tac3d-port", str(port)]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "nothing heard" in said
-    assert "does not answer" in said
-
-
-def test_a_pin_board_gives_a_geometry(tmp_path):
-    board = ROOT / "tests" / "data" / "9DTact"
-    pins = ["--background", board / "board_ref.png", "--rows", 7, "--columns", 9]
-    args = ["geometry", board / "board_sample.png", *pins]
-    assert run(*args, "--pitch-mm", 2.5, "--out", tmp_path / "g.json") == 0
-    assert CameraGeometry.load(tmp_path / "g.json").held_out_mm < 0.07
-    assert run(*args, "--pitch-mm", -1, "--out", tmp_path / "h.json") == 1
-    assert not (tmp_path / "h.json").exists()
 
 
 def pictures(folder, brightness):

@@ -21,7 +21,7 @@ from sensors_io.records import RecordsExistError, RecordStore
 from sensors_io.schema import ATTRIBUTES, ContactKey
 from tests.sensors_io import fakes
 from tests.sensors_io.checks import refused
-from tests.sensors_io.importers.films import EVERYTHING, imported, picture
+from tests.sensors_io.importers.films import EVERYTHING, imported
 
 
 def take(n, key):
@@ -87,15 +87,6 @@ def test_nothing_readable_is_an_error_and_leaves_nothing(tmp_path):
     import_catalogue(catalogue(), tmp_path)
     other = dataclasses.replace(catalogue(), identity="abcd")
     refused(RecordsExistError, "made by config 'c0ffee', not 'abcd'", import_catalogue, other, tmp_path)
-
-
-def test_the_view_of_the_first_contact_is_stored(tmp_path):
-    path = picture(tmp_path / "in" / "view.png", shape=(480, 640))
-    assert imported(catalogue(3, view=path), tmp_path / "out")[1].objects["object_0"].view.shape == (240, 320, 3)
-    path.write_bytes(b"broken")
-    report, store = imported(catalogue(3, view=path), tmp_path / "again")
-    assert Skip(name="view.png", reason="view does not open as a picture") in report.skipped
-    assert store.objects["object_0"].view is None
 
 
 def test_the_fingerprint_is_of_config_names_sizes_and_listings(tmp_path):

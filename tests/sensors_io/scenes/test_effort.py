@@ -3,16 +3,14 @@
 import dataclasses
 
 import numpy as np
-import pytest
 
 from sensors_io import codec
 from sensors_io.scenes import effort, protocol
-from sensors_io.scenes.config import SceneConfig, config_hash
+from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.draws import draw
 from sensors_io.scenes.sensors import TAC3D
 from sensors_io.scenes.sequence import make_sequence
 from sensors_io.schema import Flag
-from tests.sensors_io.checks import refused
 
 CONFIG = SceneConfig(objects=2, sites=1, frames=3, max_force_n=4.0)
 ORDER = 2  # Tac3D, which has no picture to render
@@ -54,15 +52,3 @@ def test_records_say_on_which_grid_they_were_solved():
     assert np.all(made.flags & Flag.ERROR_UNMET)
     again = codec.decode_sequence(codec.encode_sequence(made))
     np.testing.assert_array_equal(again.contact_grid, made.contact_grid)
-
-
-def test_without_an_error_nothing_changes():
-    made = make_sequence(CONFIG, 0, protocol.slot(CONFIG, 0), ORDER, 0)
-    assert made.contact_grid is None
-    assert not np.any(made.flags & Flag.ERROR_UNMET)
-    assert config_hash(CONFIG) != config_hash(dataclasses.replace(CONFIG, error=0.05))
-
-
-@pytest.mark.parametrize("error", [0.0, 1.5])
-def test_an_error_out_of_range_is_refused(error):
-    refused(ValueError, r"error is .*must lie in \(0, 1\]", SceneConfig, error=error)

@@ -57,13 +57,6 @@ def test_a_half_space_is_exact(share: float) -> None:
     assert off(exact.traction_mpa, cheap) < 0.06
 
 
-@pytest.mark.parametrize(("stuck", "left"), [(0.0, 1.0), (1.0, 0.0), (1.1, 0.0)])
-def test_the_limits_are_exact_also_after_interpolation(stuck: float, left: float) -> None:
-    p = _pressure(FORCE)
-    found = partial_slip.ciavarella_jaeger(p, stuck * p, FRICTION, 1.0)
-    np.testing.assert_allclose(found, left * FRICTION * p, rtol=1e-6)
-
-
 @pytest.mark.parametrize(("levels", "error"), [(8, 0.16), (16, 0.06)])
 def test_interpolation_meets_the_ramp_carries_every_force_and_is_near_between(levels: int, error: float) -> None:
     pressures, forces = _ramp(levels)
@@ -97,8 +90,6 @@ def _dots() -> np.ndarray:
 
 GEL = Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=4.0)
 HELD_OUT = {
-    "thin gel": (RADIUS**2 / 24, Layer(modulus_mpa=0.4, poisson=0.49, thickness_mm=2.0), None),
-    "usual gel": (RADIUS**2 / 18, GEL, None),
     "dots": (_dots(), dataclasses.replace(GEL, thickness_mm=3.0), None),
     "soft body": (RADIUS**2 / 30, GEL, 0.7),
     "thick gel": (
@@ -130,11 +121,3 @@ def test_the_promise_holds_on_held_out_contacts(name: str) -> None:
     radius = float(np.sqrt(np.sum(full > 0) * SPACING**2 / np.pi))
     promise = partial_slip.promised_error(gel, body, radius)
     assert off(cheap_mm, exact_mm) < promise < 0.2
-
-
-def test_a_thinner_gel_is_promised_less() -> None:
-    thin, thick = (
-        partial_slip.promised_error(dataclasses.replace(GEL, thickness_mm=h), None, 4.0) for h in (2.0, 20.0)
-    )
-    assert max(3 * thick, 0.05) < thin
-    assert thick < 0.05

@@ -69,13 +69,6 @@ def test_every_cell_gets_the_same_forces(made):
         assert max(counts.values()) - min(counts.values()) <= len(EXPLORATORY)
 
 
-def test_the_ceiling_is_the_worst_cells_quantile_and_never_above_the_own_limit(limits):
-    ceiling = schedule.ceilings(limits.rigid_n, _cell(), np.random.default_rng(1))
-    assert np.all(ceiling <= limits.rigid_n + 1e-12)
-    worst = min(np.sort(limits.rigid_n[_cell() == c])[-1] for c in range(9))
-    assert ceiling.max() <= worst
-
-
 def test_left_out_frames_are_counted(made, limits):
     counts = made.left_out
     touched = sum((motions.plan(s.motion, 1.0, schedule.pace(40)).force_n > 0).sum() for s in made.slots)

@@ -79,13 +79,6 @@ def test_cattaneo_and_mindlin(share: float) -> None:
     assert _force(solved) == pytest.approx(share * most, rel=1e-5)
 
 
-def test_prescribed_slide_and_prescribed_force_agree() -> None:
-    pulled = _pull(_limit(), (0.3, 0.4), _half_space())
-    slid = _slide(_limit(), complex(pulled.slide_mm), _half_space(), tolerance=1e-4)
-    assert _force(slid) == pytest.approx(0.3 + 0.4j, rel=2e-3)
-    assert off(slid.traction_mpa, pulled.traction_mpa) < 0.02
-
-
 @pytest.mark.parametrize("stick_ratio", [0.8, 0.5, 0.2, 0.0])
 def test_lubkin_twist(stick_ratio: float) -> None:
     """Down to the whole contact slipping, at a torque of 3π/16 μFa."""
@@ -96,22 +89,6 @@ def test_lubkin_twist(stick_ratio: float) -> None:
     assert moment[2] == pytest.approx(torque, rel=0.02)
     np.testing.assert_allclose(force, 0, atol=1e-4)
     assert solved.stick_share == pytest.approx(stick_ratio**2, abs=0.08)
-
-
-def test_a_long_slide_slips_everywhere() -> None:
-    limit = _rough_pressure()
-    solved = _slide(limit, 30 * np.exp(0.7j), _layer())
-    assert solved.stick_share == 0
-    assert off(solved.traction_mpa, limit * np.exp(0.7j)) < 5e-3
-
-
-def test_without_a_limit_it_sticks_and_is_linear() -> None:
-    limit = 1e3 * (_rough_pressure() > 0)
-    once, twice = (_slide(limit, s, _layer(), tolerance=1e-5) for s in (0.1 + 0.05j, 0.2 + 0.1j))
-    contact = limit > 0
-    assert once.stick_share == 1
-    np.testing.assert_allclose(once.displacement_mm[contact], 0.1 + 0.05j, atol=1e-4)
-    assert _force(twice) == pytest.approx(2 * _force(once), rel=1e-3)
 
 
 def test_the_force_limit_is_a_flag() -> None:
@@ -208,21 +185,3 @@ def test_hard_cases_converge_without_nan(name: str) -> None:
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(solved))
     assert solved.converged
     assert np.all(np.abs(solved.traction_mpa) <= limit * (1 + 1e-5))
-
-
-def test_the_cap_clears_converged() -> None:
-    solved = _slide(_rough_pressure(), 0.15, _layer(), tolerance=1e-5, max_iterations=2)
-    assert not solved.converged
-    assert solved.iterations == 2
-    assert solved.residual >= 1e-5
-
-
-def test_mapped_equals_single_and_a_start_changes_nothing() -> None:
-    limit = jnp.asarray(_rough_pressure(), jnp.float32)
-    fields = jnp.asarray(np.stack([np.full((N, N), s) for s in (0.1, 0.2j)]), jnp.complex64)
-    solve = functools.partial(tangential.solve, limit, compliance=_layer(), tolerance=1e-4)
-    mapped = jax.jit(lambda f: jax.lax.map(lambda one: solve(one), f))(fields)
-    single = _slide(_rough_pressure(), 0.2j, _layer(), tolerance=1e-4)
-    warm = _slide(_rough_pressure(), 0.2j, _layer(), tolerance=1e-4, start_mpa=mapped.traction_mpa[0])
-    for found in (mapped.displacement_mm[1], warm.displacement_mm):
-        np.testing.assert_allclose(found, single.displacement_mm, atol=2e-3)

@@ -77,18 +77,6 @@ def test_one_connection_serves_many_pictures_and_each_is_drawn_once():
     assert drawn[0] != threading.get_ident()
 
 
-def test_streams_end_with_the_view_and_a_taken_port_is_an_error():
-    with LiveView(port=0) as view:
-        port = int(urllib.parse.urlsplit(view.address).port)
-        with pytest.raises(OSError, match="in use"), LiveView(port=port):
-            pass
-        view.publish({}, NUMBERS)
-        events = ask(view, "numbers")
-        events.readline()
-    assert events.read() == b"\n"
-    events.close()
-
-
 def test_panels_of_a_sample():
     grey = np.zeros((4, 4, 3), np.uint8)
     shown = lambda frame, **arrays: panels(Sample(host_time_ns=0, frame=frame, arrays=arrays))
@@ -177,18 +165,6 @@ def test_requests_of_no_browser_are_refused_without_a_word_in_the_terminal(capfd
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         assert requested(view)[0] == 200
     assert capfd.readouterr().err == ""
-
-
-def test_connections_too_many_are_closed():
-    with LiveView(port=0) as view:
-        port = int(urllib.parse.urlsplit(view.address).port)
-        before = threading.active_count()
-        silent = [socket.create_connection(("127.0.0.1", port), timeout=10) for _ in range(100)]
-        for connection in silent[64:]:
-            assert connection.recv(1) == b""
-        assert threading.active_count() - before <= 64
-        for connection in silent:
-            connection.close()
 
 
 def test_numbers_that_json_does_not_know_are_null():
