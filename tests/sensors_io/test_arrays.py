@@ -13,7 +13,8 @@ def test_arrays_come_back_from_both_formats(tmp_path):
     arrays = {"a": np.arange(6.0).reshape(2, 3), "b": np.array("text"), "c": np.asfortranarray(np.ones((2, 2), ">i4"))}
     np.savez_compressed(tmp_path / "x.npz", **arrays)
     np.testing.assert_equal(load_arrays(tmp_path / "x.npz"), arrays)
-    np.save(tmp_path / "a.npy", arrays["a"])
+    with (tmp_path / "a.npy").open("wb") as file:
+        np.lib.format.write_array(file, arrays["a"], version=(2, 0))
     np.testing.assert_equal(load_arrays(tmp_path / "a.npy"), {"a": arrays["a"]})
 
 

@@ -1,6 +1,7 @@
 """Sequences and cards as bytes: exact where it is promised, within the stated error elsewhere, never silently wrong."""
 
 import dataclasses
+import json
 import zlib
 
 import hypothesis
@@ -92,7 +93,7 @@ def test_what_cannot_be_stored_is_refused():
     for bad in (np.nan, np.inf, -np.inf):
         depth = np.where(np.arange(360).reshape(12, 5, 6) == 101, bad, 0).astype(np.float32)
         refused(SchemaError, said, codec.encode_sequence, sequence(depth_mm=depth))
-    for gain in (np.float32(1), float("nan")):
+    for gain in (np.float32(1), float("nan"), float("inf")):
         said = "settings cannot be stored as JSON"
         refused(SchemaError, said, codec.encode_sequence, sequence(camera={"gain": gain}))
 
@@ -129,6 +130,23 @@ def test_a_cut_entry_and_a_wrong_kind_are_found():
         with pytest.raises(codec.CorruptRecordsError):
             codec.decode_sequence(entry[:cut])
     refused(codec.CorruptRecordsError, "is of kind 'sequence', not 'object'", codec.decode_card, entry)
+
+
+def test_the_layout_describes_itself_and_arrays_are_aligned():
+    entry = codec.encode_sequence(sequence())
+    end = 12 + int.from_bytes(entry[8:12], "little")
+    header = json.loads(entry[12:end])
+    assert header["plain"]["key"]["object_id"] == "object_0"
+    assert [a["name"] for a in header["arrays"]][:2] == ["frames", "deformation_mm"]
+    assert bytes(sequence().frames[0, 0, 0]) == entry[end:][:3]
+    assert (end % 8, len(entry) % 8) == (0, 0)
+
+
+def test_errors_are_half_a_micrometre_a_millinewton_and_a_hundredth_of_a_newton_millimetre():
+    lengths, forces = ("deformation_mm", "shear_mm", "depth_mm"), ("force_n", "target_force_n")
+    stated = dict.fromkeys(lengths, 5e-4) | dict.fromkeys(forces, 1e-3) | {"moment_nmm": 1e-2}
+    assert stated == codec.TOLERANCE
+    assert {round(codec.WIDEST[name]) for name in (*lengths, *forces, "moment_nmm")} == {32, 64, 512}
 
 
 def test_fields_can_be_left_out_only_beside_frames():

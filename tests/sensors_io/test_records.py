@@ -146,7 +146,7 @@ os.kill(os.getpid(), signal.SIGKILL)
         done = subprocess.run([sys.executable, "-c", code], check=False, cwd=os.getcwd())
         assert done.returncode == -signal.SIGKILL
         assert [p.name for p in tmp_path.glob(".contacts*.tmp")] == [".contacts-00002.arrayrecord.tmp"]
-        assert len(RecordStore(tmp_path, allow_incomplete=True)) == 4
+        refused(records.IncompleteRecordsError, "4 contacts", RecordStore, tmp_path)
         (tmp_path / "contacts-00002.arrayrecord").write_bytes(b"published, never listed")
         with RecordWriter(tmp_path, meta=fakes.META, resume=True) as writer:
             assert (writer.contacts_done, writer.objects_done) == (4, {"object_0"})

@@ -67,6 +67,14 @@ def test_the_mask_is_the_contact(contact_mm: float) -> None:
     assert np.sqrt(found.mask.sum() / np.pi) * PITCH == pytest.approx(contact_mm, rel=0.05)
 
 
+@pytest.mark.parametrize("at", [(5, 120), (315, 120), (160, 5), (160, 235)])
+def test_contacts_at_each_border_and_beside_another_are_there(at: tuple[int, int]) -> None:
+    assert find_contacts(pressed(*at)[0], PITCH).at_border
+    both = np.maximum(pressed(80, 120, 0.8)[0] - 0.1, pressed(240, 120, 0.8)[0] - 0.1)
+    found = find_contacts(both, PITCH)
+    assert (found.count, found.at_border) == (2, False)
+
+
 def test_hysteresis_keeps_no_shallow_region_and_no_speck() -> None:
     config = ContactConfig(low_mm=0.03, high_mm=0.06)
     shallow = np.zeros((240, 320), np.float32)

@@ -93,7 +93,7 @@ def test_a_marker_gel_with_calibration_gives_everything() -> None:
     assert fields.shear_mm is not None
     assert fields.traction_mpa is not None
     assert fields.force_n is not None
-    assert fields.shear_mm.shape == fields.deformation_mm.shape  # type: ignore[union-attr]
+    assert fields.shear_mm.shape == fields.deformation_mm.shape == (1, 9, 12, 2)  # type: ignore[union-attr]
     noisy = Extractor(dotted(), 0.1, calibration(dotted()), ExtractConfig(nodes=12, shear="subtracted"))
     subtracted = noisy.read(dotted(0.5)).shear_mm
     assert not np.allclose(subtracted, fields.shear_mm, atol=1e-3)  # type: ignore[arg-type]

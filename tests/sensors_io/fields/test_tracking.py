@@ -122,6 +122,8 @@ def test_lost_markers_flag_the_frame_and_their_nodes():
 def test_a_dense_pattern_is_read_too():
     rest = gels.speckle()
     reader = DeformationReader(gels.rgb(gels.exposed(rest)), mm_per_px=0.1, shape=(16, 20))
+    x, y = (np.unique(side) for side in reader.tracker.points_px.T)  # windows of 17 px, 12 px apart, a pixel inside
+    np.testing.assert_allclose([*x[[0, -1]], *y[[0, -1]], len(x), len(y)], [9, 190, 9, 150, 16, 13])
     read = reader.read(gels.rgb(gels.exposed(np.roll(rest, (3, -2), (0, 1)), seed=1)))
     inner = read.displacement_mm[2:-2, 2:-2]
     np.testing.assert_allclose(inner, np.broadcast_to([-0.2, 0.3], inner.shape), atol=0.01)

@@ -1,5 +1,8 @@
 """Procedural objects: labels follow the thresholds, materials inform without deciding, skins move rigidly."""
 
+import dataclasses
+from collections.abc import Iterator
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,7 +16,19 @@ ALL = {**properties.PROPERTIES, **properties.DYNAMIC}
 OLD = (7, 7, 1, 6.169470845, 0.106939634, 0.349118311, 2.499351735, 4.172926426)
 """Material, apparent material, pattern, modulus, rms, height, turn and last phase of the first object ever drawn."""
 
+KINDS = ((1, "part"), (2, "graded"))
+SUMS = (698.749806, 758.587112, 921.512811)
+"""Sums of all numbers of that object, of the second if it has a part, and of the third if it is graded."""
+
 NEAR_GAP = 0.999  # values come this close to the edge of the gap around a threshold
+
+
+def _numbers(made) -> Iterator[np.ndarray]:
+    for value in vars(made).values():
+        if dataclasses.is_dataclass(value):
+            yield from _numbers(value)
+        elif value is not None and np.asarray(value).dtype.kind in "fiu":
+            yield np.asarray(value)
 
 
 def _sample(count: int, lie_share: float = 0.3) -> list[objects.Solid]:
@@ -128,6 +143,9 @@ def test_an_object_of_old_is_the_same_today() -> None:
     assert (solid.material, solid.looks_like, solid.pattern) == OLD[:3]
     numbers = (solid.modulus_mpa, solid.rms_mm, solid.feature_height_mm, solid.turn_rad, solid.wave_phases_rad[-1])
     np.testing.assert_allclose(numbers, OLD[3:], rtol=1e-6)
+    varied = (objects.sample(np.random.default_rng(n), 0.3, 0.8, **{f"{kind}_share": 1.0}) for n, kind in KINDS)
+    sums = [sum(np.sum(x) for x in _numbers(solid)) for solid in (solid, *varied)]
+    np.testing.assert_allclose(sums, SUMS, rtol=1e-6)
 
 
 def test_a_part_has_its_own_values_and_the_object_no_common_label() -> None:

@@ -134,14 +134,22 @@ def test_the_hash_tells_configs_apart_and_later_fields_leave_it_as_it_was() -> N
 
 
 def test_bad_configs_are_refused_by_name() -> None:
-    wrong: dict[str, tuple] = {
-        "objects": (0,), "sites": (0,), "frames": (0,), "contact_grid": (20, 41), "image_px": (8,), "error": (0.0, 1.5),
-        "visual_lie_share": (1.2,), "min_force_n": (0.0, 30.0), "split_shares": ((0.5, 0.2, 0.2),),
-        "solver_tolerance": (0.0,), "force_jitter": (0.5,), "graded_share": (1.1,),
+    """The last value that is taken, and the first ones that are not."""
+    edges: dict[str, tuple] = {
+        "objects": (1, 0), "sites": (1, 0), "frames": (1, 0), "contact_grid": (24, 22, 25), "image_px": (16, 15),
+        "view_px": (16, 15), "error": (1.0, 0.0, 1.01), "visual_lie_share": (1.0, -0.01, 1.01),
+        "min_force_n": (20.0, 0.0, 20.1), "force_jitter": (0.1, -0.01, 0.11), "force_gain_error": (1.0, -0.01, 1.01),
+        "force_noise_n": (0.0, -0.01), "ramp_s": (0.01, 0.0), "adhesion_j_per_m2": (0.0, -1.0),
+        "adhesion_tolerance": (0.01, 0.0), "part_share": (1.0, -0.01), "graded_share": (1.0, -0.01, 1.01),
+        "split_shares": ((0.0, 0.5, 0.5), (0.5, 0.2, 0.2), (-0.2, 0.6, 0.6)), "solver_tolerance": (0.99, 0.0, 1.0),
+        "solver_max_iterations": (1, 0), "seed": (0, -1),
     }  # fmt: skip
-    for name, values in wrong.items():
-        for value in values:
+    for name, (edge, *wrong) in edges.items():
+        assert getattr(dataclasses.replace(SMALL, **{name: edge}), name) == edge
+        for value in wrong:
             refused(ValueError, f"{name} is .*must", dataclasses.replace, SMALL, **{name: value})
+    refused(ValueError, "graded_share is .*must", SceneConfig, part_share=0.5, graded_share=0.6)
+    assert SMALL.contact_count == 120
 
 
 def test_padding_is_two_thicknesses_and_smooth() -> None:
