@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import pathlib
 import zlib
 
 import hypothesis
@@ -12,10 +13,10 @@ from hypothesis.extra import numpy as hnp
 
 from sensors_io import codec
 from sensors_io.schema import FRAME_ARRAYS, SENSORS, SchemaError
-from tests.sensors_io import old_entries
 from tests.sensors_io.checks import refused
 from tests.sensors_io.fakes import card, sequence
 
+ENTRIES = pathlib.Path(__file__).parents[1] / "data" / "entries_v1"
 EXACT = [name for name in FRAME_ARRAYS if name not in codec.TOLERANCE]
 
 
@@ -108,11 +109,13 @@ def test_every_flipped_bit_is_found(data):
 
 
 def test_entries_of_version_1_are_read():
-    old = codec.decode_sequence(old_entries.SEQUENCE)
-    assert old_entries.SEQUENCE[:4] == b"TCH1"
+    """Object 0 of `fakes`, two frames of 4 × 5 px whose bytes count up, and card 1 without the depth of its view."""
+    stored, card_1 = ((ENTRIES / f"{name}.bin").read_bytes() for name in ("sequence", "card"))
+    old = codec.decode_sequence(stored)
+    assert stored[:4] == b"TCH1"
     np.testing.assert_array_equal(old.frames.ravel(), np.arange(120))
     np.testing.assert_array_equal(old.depth_mm, np.full((2, 2, 3), 0.25))
-    np.testing.assert_array_equal(codec.decode_card(old_entries.CARD).view, card(1).view)
+    np.testing.assert_array_equal(codec.decode_card(card_1).view, card(1).view)
     again = codec.decode_sequence(codec.encode_sequence(old))
     np.testing.assert_array_equal(again.frames, old.frames)
 

@@ -1,16 +1,12 @@
 """Messages that break a protocol end no stream and are counted once."""
 
-import time
-
 import numpy as np
 import pytest
 
 from sensors_io.clock import JumpingClock
-from sensors_io.devices.errors import WrongRateWarning
 from sensors_io.devices.intake import Intake
 from sensors_io.devices.reader import Reader
 from tests.sensors_io.devices.fakes import sample, sent
-from tests.sensors_io.devices.test_netft import record, sensor
 from tests.sensors_io.devices.test_tac3d import datagrams, listening, pushed
 
 FINE = pushed([0, 0, -1], [0, 0, -0.1])
@@ -46,22 +42,3 @@ def test_a_broken_sample_is_lost_once():
     for index in (0, 1, None, 3, 6):
         intake.broke() if index is None else intake.offer(sample(index))
     assert (intake.counts.missing, intake.counts.broken, intake.counts.lost) == (2, 1, 3)
-
-
-def test_a_wrong_rate_of_a_force_sensor_warns_and_leaves_its_stamps_out():
-    class Slow(list):
-        """Records every 10 ms: 100 a second."""
-
-        def __iter__(self):
-            for datagram in super().__iter__():
-                time.sleep(0.01)
-                yield datagram
-
-    with (
-        sensor(Slow(record(k, *[0] * 6) for k in range(60))) as (config, _),
-        config.open() as device,
-        pytest.warns(WrongRateWarning, match="rate_hz is 1000"),
-    ):
-        stamps = [device.read(5.0).device_time_ns for _ in range(60)]
-    assert stamps[0] == 0
-    assert stamps[-5:] == [None] * 5

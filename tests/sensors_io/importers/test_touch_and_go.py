@@ -45,16 +45,6 @@ def test_touches_become_records(source, tmp_path):
     assert not sequence.flags.any()
 
 
-def test_recorded_times_are_used_where_they_are(source, tmp_path):
-    np.save(source / "dataset" / FIRST / "time2.npy", 1647.0 + np.arange(62) ** 2 / 100)
-    np.save(source / "dataset" / SECOND / "time2.npy", np.arange(2.0))
-    report, store = imported(list_touch_and_go(source, EVERYTHING), tmp_path / "out")
-    sequence = store.contact(0)["gelsight"]
-    np.testing.assert_allclose(sequence.host_time_ns, [250_000_000, 360_000_000, 490_000_000], atol=100)
-    assert sequence.camera["clock"] == "time2.npy"
-    assert [skip.name for skip in report.skipped] == [f"{SECOND}/0000000001", f"{SECOND}-wood"]
-
-
 def test_lines_and_frames_that_say_nothing_certain_are_skipped(source, tmp_path):
     bad = [f"{FIRST}/61.jpg,3", f"{FIRST}/0000000061.jpg,20", f"{FIRST}/0000000005.jpg,2", "nonsense"]
     (source / "train.txt").write_text("\n".join(bad))

@@ -5,7 +5,6 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from sensors_io.layer import Layer
 from sensors_io.scenes import drag, traction
@@ -107,11 +106,3 @@ def test_what_lets_go_forgets() -> None:
     np.testing.assert_array_equal(made.traction_mpa[2], 0)
     np.testing.assert_allclose(made.force_n[3, 0], 0, atol=1e-4)
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(made))
-
-
-def test_a_twist_turns_the_gel_and_slips_at_its_torque() -> None:
-    made = _frames([_pressure(2.0)] * 8, np.zeros((8, 2)), _half_space(), np.linspace(0, 6, 8))
-    a = Hertz(radius_mm=8.0, plane_modulus_mpa=2 * SHEAR_MODULUS, force_n=2.0).contact_radius_mm
-    assert made.moment_nmm[-1, 2] == pytest.approx(3 * np.pi / 16 * FRICTION * 2.0 * a, rel=0.03)
-    assert np.all(np.diff(made.moment_nmm[:, 2]) > -1e-3)
-    np.testing.assert_allclose(made.force_n[:, :2], 0, atol=1e-3)

@@ -36,14 +36,6 @@ def test_less_error_takes_more_effort_and_what_cannot_be_met_is_said():
     assert (_choose(0.9).met, _choose(1e-4).met) == (True, False)
 
 
-def test_where_nothing_touches_the_least_effort_will_do():
-    made = _drawn()
-    path = dataclasses.replace(made.press.path, force_n=np.zeros(3, np.float32))
-    press = dataclasses.replace(made.press, path=path)
-    chosen = effort.choose(0.01, press, made.unit.modulus_factor, made.sensor)
-    assert (chosen.grid, chosen.met) == (effort.GRIDS[0], True)
-
-
 def test_records_say_on_which_grid_they_were_solved():
     asking = dataclasses.replace(CONFIG, error=1e-4)
     made = make_sequence(asking, 0, protocol.slot(asking, 0), ORDER, 0)

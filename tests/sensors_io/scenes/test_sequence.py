@@ -101,15 +101,6 @@ def test_a_draw_is_what_the_sequence_was_made_of(slide):
     assert np.all(drawn.press.path.force_n >= drawn.force_n.astype(np.float32))
 
 
-def test_a_coupled_press_feels_the_spreading_gel_and_an_uncoupled_one_nothing(hold):
-    coupled = make_sequence(dataclasses.replace(CONFIG, coupled=True), 6, _slot("hold", 8.0), TAC3D, 0)
-    np.testing.assert_array_equal(coupled.depth_mm.shape, hold.depth_mm.shape)
-    pressed = hold.target_force_n > 4
-    change = np.abs(coupled.shear_mm - hold.shear_mm)[pressed].max()
-    assert 0.002 < change < 0.5  # above the rounding, below what would be a slide
-    assert np.abs(coupled.force_n[:, :2] - hold.force_n[:, :2]).max() < 0.3  # what spreads evenly pulls nowhere
-
-
 def test_limits_lie_where_the_strain_does():
     """The look's limit, on one sensor and a coarse grid, against presses at that force."""
     sites = [site_of(CONFIG, i, 0, 0) for i in range(10)]

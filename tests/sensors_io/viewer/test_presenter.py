@@ -1,14 +1,13 @@
 """What a bench shows, from fake devices."""
 
 import json
-import threading
 import time
 
 import numpy as np
 import pytest
 
 from sensors_io.devices.base import Identity, Sample
-from sensors_io.devices.errors import StaleFrameError, StreamEndedError
+from sensors_io.devices.errors import StaleFrameError
 from sensors_io.devices.intake import Counts
 from sensors_io.schema import Flag
 from sensors_io.viewer.presenter import Channel, Presenter
@@ -72,16 +71,3 @@ def test_alarms_are_told_worst_first(live):
     assert "too slowly" in shown(presenter, live)["alarm"]
     skin.newest = StaleFrameError("old")
     assert not presenter.step()
-
-
-def test_it_runs_beside_and_stops_with_its_device(live):
-    device = Watched("tac3d", {"depth_mm": np.zeros((4, 4))})
-    presenter = Presenter([Channel(device)], None, live)
-    with presenter.beside():
-        deadline = time.monotonic() + 5
-        while live.shown.version == 0 and time.monotonic() < deadline:
-            time.sleep(0.01)
-    assert live.shown.version == 1
-    device.newest = StreamEndedError("over")
-    presenter.run(lambda: False)
-    assert not [t for t in threading.enumerate() if t.name == "presenter"]

@@ -5,7 +5,6 @@ import http.client
 import json
 import socket
 import struct
-import threading
 import urllib.error
 import urllib.parse
 import urllib.request
@@ -55,26 +54,6 @@ def test_page_numbers_and_pictures():
         assert picture(view, "tac3d: depth").mean((0, 1))[0] > 180
         for path in ("panel/shear", "etc/passwd"):
             refused(urllib.error.HTTPError, "404", ask, view, path)
-
-
-def test_one_connection_serves_many_pictures_and_each_is_drawn_once():
-    drawn = []
-
-    def panel():
-        drawn.append(threading.get_ident())
-        return np.zeros((4, 4, 3), np.uint8)
-
-    with LiveView(port=0) as view:
-        host, port = view.address.removeprefix("http://").rstrip("/").split(":")
-        connection = http.client.HTTPConnection(host, int(port), timeout=10)
-        view.publish({"camera": panel}, NUMBERS)
-        assert drawn == []  # nobody has looked yet
-        for _ in range(5):
-            connection.request("GET", "/panel/camera")
-            assert connection.getresponse().read()[:2] == b"\xff\xd8"
-        connection.close()
-    assert len(drawn) == 1
-    assert drawn[0] != threading.get_ident()
 
 
 def test_panels_of_a_sample():
