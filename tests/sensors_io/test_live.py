@@ -10,9 +10,8 @@ from sensors_io.live import LiveScenes
 from sensors_io.pipeline import ClipConfig, clip_batches
 from sensors_io.records import RecordStore
 from sensors_io.scenes.config import SceneConfig
-from sensors_io.schema import CLIP_ARRAYS, SchemaError
+from sensors_io.schema import CLIP_ARRAYS
 from tests.sensors_io import fakes
-from tests.sensors_io.checks import refused
 
 CONFIG = SceneConfig(objects=6, sites=1)
 CLIP = ClipConfig(frames=3, image_px=8, view_px=8, sensors=("xense", "tac3d"))
@@ -52,10 +51,3 @@ def test_a_feed_resumes_from_its_state(scenes):
     again.set_state(feed.get_state())
     for _ in range(3):
         np.testing.assert_array_equal(next(again)["contact"], next(feed)["contact"])
-
-
-def test_splits_are_those_of_the_cards(scenes):
-    split = scenes.objects["object_0"].split
-    rows = scenes.contacts_of_split(split)
-    assert [scenes.objects[scenes.contacts[i].object_id].split for i in rows] == [split] * len(rows)
-    refused(SchemaError, "split is 'testing'", scenes.contacts_of_split, "testing")

@@ -91,11 +91,6 @@ def test_frames_are_unique_increasing_and_hold_the_deepest_press(length, count, 
     assert deepest[chosen].max() == deepest.max()
 
 
-@pytest.mark.parametrize("made", [pressed(np.full(20, 3.0)), filmed(np.zeros(20))])
-def test_where_nothing_changes_frames_are_even_in_time(made):
-    np.testing.assert_array_equal(choose_frames(made, 5, REJECTED), [0, 5, 9, 14, 19])
-
-
 def test_rejected_frames_are_left_out_while_others_remain():
     flags = np.zeros(20, np.uint32)
     flags[15:] = int(Flag.STRAIN_LIMIT | Flag.BORDER_CONTACT)

@@ -81,8 +81,10 @@ def test_a_geometry_is_saved_and_loaded(tmp_path):
     loaded = CameraGeometry.load(tmp_path / "g.json")
     point = np.array([[10.0, 20.0]])
     np.testing.assert_array_equal(loaded.to_mm(point), lens().to_mm(point))
-    (tmp_path / "g.json").write_text("{}")
-    refused(GeometryError, "is no geometry", CameraGeometry.load, tmp_path / "g.json")
+    text = (tmp_path / "g.json").read_text()
+    for changed in ("{}", text.replace("0.06", "0.07", 1), text.replace("0.06", "NaN", 1)):
+        (tmp_path / "g.json").write_text(changed)
+        refused(GeometryError, "is no geometry|was changed|hash", CameraGeometry.load, tmp_path / "g.json")
 
 
 def test_bad_boards_are_refused():

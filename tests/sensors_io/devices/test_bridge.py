@@ -9,11 +9,10 @@ import sys
 import time
 import venv
 
-import numpy as np
 import pytest
 
 from sensors_io.devices import bridge
-from sensors_io.devices.errors import DeviceDataError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
+from sensors_io.devices.errors import DeviceDataError, DeviceLostError, DeviceNotFoundError
 from tests.sensors_io.checks import refused
 
 SDK = "tests.sensors_io.devices.vendor_sdk:frames"
@@ -23,29 +22,13 @@ def config(serial, **rest):
     return bridge.BridgeConfig(python=sys.executable, adapter=SDK, serial=serial, **rest)
 
 
-def test_frames_cross_though_the_sdk_prints(monkeypatch, request):
-    monkeypatch.chdir(request.config.rootpath)
-    with config("3").open() as device:
-        samples = [device.read(10.0) for _ in range(3)]
-        refused(DeviceLostError, r"has ended.*vendor banner", device.read, 10.0)
-    assert [s.index for s in samples] == [0, 1, 2]
-    assert samples[1].frame[0, 0].tolist() == [200, 1, 1]
-    assert samples[2].arrays["depth_mm"].dtype == np.float32
-    assert samples[2].arrays["depth_mm"][0, 0] == 1.0
-    assert samples[0].arrays["force_n"].tolist() == [0, 1, 2]
-    assert samples[0].arrays["moment_nmm"].tolist() == [3, 4, 5]
-    now_ns = time.monotonic_ns()
-    assert all(0 <= now_ns - s.host_time_ns < 60e9 for s in samples)
-
-
 def test_a_failing_sdk_says_its_last_words(monkeypatch, request):
     monkeypatch.chdir(request.config.rootpath)
-    with pytest.raises(DeviceNotFoundError, match="no such sensor"), config("fails").open():
+    with pytest.raises(DeviceNotFoundError, match="no such sensor"), config("1").open():
         pass
     with pytest.raises(DeviceNotFoundError, match="does not start"), bridge.BridgeConfig(python="/nowhere").open():
         pass
     refused(DeviceLostError, "not open", lambda: config("3").open().read(0.1))
-    assert issubclass(DeviceTimeoutError, RuntimeError)
 
 
 def test_damaged_frames_are_refused():

@@ -72,4 +72,5 @@ def test_texture_is_that_of_the_weaker_direction_and_scales_with_contrast():
     full, half = (texture_of((128 + share * (gels.speckle() - 128)).astype(np.float32)) for share in (1, 0.5))
     assert texture_of(stripes.astype(np.float32)) < 1e-3
     assert full == pytest.approx(2 * half, rel=1e-4)
+    assert texture_of(gels.speckle().T.astype(np.float32)) == pytest.approx(full, rel=1e-3)
     assert full > 3

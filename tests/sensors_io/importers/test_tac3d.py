@@ -66,18 +66,6 @@ def test_gaps_of_the_counter_are_flagged_and_counted(tmp_path):
     assert sequence.camera["missing_frames"] == 9
 
 
-def test_receive_times_are_host_times_where_they_are_stored(tmp_path):
-    write(tmp_path / "in", "a_S1")
-    write(tmp_path / "in", "b_S2", recvTimestamp=np.array([0.04, 0.07, 0.52]))
-    write(tmp_path / "in", "c_S3", recvTimestamp=np.array([0.04, 0.03, 0.52]))
-    report, store = read(tmp_path / "in", tmp_path / "out")
-    sent, received = (store.contact(i)["tac3d"] for i in range(2))
-    np.testing.assert_array_equal(sent.host_time_ns, sent.device_time_ns)
-    assert received.host_time_ns.tolist() == [40_000_000, 70_000_000, 520_000_000]
-    np.testing.assert_array_equal(received.force_time_ns, received.device_time_ns)
-    assert report.skipped[0].reason == "has receive times that run backwards"
-
-
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [

@@ -1,12 +1,13 @@
 """Samples that a sensor got wrong: the contact is kept, the rows are flagged and counted, later sessions go on."""
 
 import dataclasses
+import pathlib
 
 import numpy as np
 import pytest
 
 from sensors_io.recording.session import record_session
-from sensors_io.records import RecordStore
+from sensors_io.records import CorruptRecordsError, RecordStore
 from sensors_io.schema import Flag, SchemaError
 from tests.sensors_io.recording.hand import Camera, Hand, Scale, Skin
 from tests.sensors_io.recording.test_session import CONFIG, SHORT
@@ -73,3 +74,15 @@ def test_a_contact_that_cannot_be_stored_keeps_its_journal_and_later_sessions_go
     assert [p.name for p in (tmp_path / ".journals").iterdir()] == ["cup-0-press-0.refused"]
     hand = Hand()
     assert record_session(tmp_path, SHORT, [Camera(hand)], Scale(hand), show=hand.show).contacts == 2
+
+
+def test_journals_stay_until_their_contacts_were_read_back(tmp_path, monkeypatch):
+    hand = Hand()
+
+    def damaged(store, i):
+        raise CorruptRecordsError("the entry's checksum does not hold")
+
+    monkeypatch.setattr("sensors_io.records.RecordStore.contact", damaged)
+    with pytest.raises(CorruptRecordsError):
+        record_session(tmp_path, SHORT, [Camera(hand)], Scale(hand), show=hand.show)
+    assert len(list(pathlib.Path(tmp_path / ".journals").glob("*.journal"))) == 2

@@ -9,14 +9,13 @@ import sys
 
 import cv2
 import numpy as np
-import pytest
 
 from sensors_io.force import ForceError, GravityModel
 from sensors_io.recording.book import ATTEMPTS, ObjectView
 from sensors_io.recording.coach import CoachConfig, ContactStage, protocol
 from sensors_io.recording.session import SessionConfig, record_session
-from sensors_io.records import RecordsExistError, RecordStore
-from sensors_io.schema import Flag, SchemaError
+from sensors_io.records import RecordStore
+from sensors_io.schema import Flag
 from tests.sensors_io.checks import refused
 from tests.sensors_io.recording.hand import MS, Camera, Hand, Scale, Skin
 
@@ -145,14 +144,6 @@ def test_two_sensors_make_one_contact_on_one_clock(tmp_path):
     as_stamped = both(tmp_path / "as stamped")[1].contact(0)
     first = [s.host_time_ns[np.argmax(-s.force_n[:, 2] > 0.25)] for s in as_stamped.values()]
     assert first[1] - first[0] == 30 * MS
-
-
-def test_sensors_of_one_name_and_records_of_other_sensors_are_refused(tmp_path):
-    hand = Hand()
-    with pytest.raises(SchemaError, match="name two of one kind apart"):
-        record_session(tmp_path, SHORT, [Camera(hand), Camera(hand)], Scale(hand), show=hand.show)
-    session(tmp_path, hand, SHORT)
-    refused(RecordsExistError, r"recorded-2 gelsight_mini', not 'recorded-2 gelsight_mini\+tac3d'", both, tmp_path)
 
 
 def test_the_gel_at_rest_and_the_object_are_kept(tmp_path):

@@ -88,13 +88,6 @@ def test_the_pace_fits_any_length(pace):
         assert hand.force_n.max() == pytest.approx(5)
 
 
-def test_presses_alone_go_object_by_object():
-    config = SceneConfig(objects=4, sites=3)
-    slots = [schedule.press_slot(config, i) for i in range(12)]
-    assert [s.object_index for s in slots] == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3]
-    assert [s.site for s in slots] == [0, 1, 2] * 4
-
-
 def test_weak_objects_and_bad_sizes_are_refused_by_name():
     weak = Limits(actual_n=np.full(OBJECTS, 4.0), rigid_n=np.full(OBJECTS, 4.0))
     refused(ValueError, "objects is 360: none of them bears 10 N", schedule.protocol, CONFIG, weak, _cell())

@@ -7,7 +7,7 @@ import pytest
 
 from sensors_io.scenes import motions, protocol, schedule, strength
 from sensors_io.scenes.config import SceneConfig
-from sensors_io.scenes.draws import draw, site_of
+from sensors_io.scenes.draws import site_of
 from sensors_io.scenes.protocol import make_contact
 from sensors_io.scenes.sensors import MODELS
 from sensors_io.scenes.sequence import make_sequence
@@ -90,15 +90,6 @@ def test_a_contact_past_the_limit_is_replaced_by_another_site(monkeypatch, hold)
         made = make_contact(config, 0)
         assert tried == [0] * 4
         assert all(s.flags.any() for s in made)
-
-
-def test_a_draw_is_what_the_sequence_was_made_of(slide):
-    drawn = draw(CONFIG, 5, _slot("slide_x"), TAC3D)
-    assert slide.serial == f"generated-tac3d-{drawn.serial}"
-    np.testing.assert_array_equal(slide.target_force_n, drawn.hand.force_n.astype(np.float32))
-    normal = np.column_stack([np.zeros((40, 2)), -drawn.force_n])
-    np.testing.assert_allclose(slide.force_n[:, 2], drawn.force_sensor.read(normal)[:, 2])
-    assert np.all(drawn.press.path.force_n >= drawn.force_n.astype(np.float32))
 
 
 def test_limits_lie_where_the_strain_does():
