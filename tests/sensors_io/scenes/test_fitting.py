@@ -1,5 +1,7 @@
 """The fit finds again what pictures were made with, and a ball's profile is the ball."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -69,3 +71,7 @@ def test_noise_and_grain_are_found_again(presses: BallPictures) -> None:
         assert noise.read[c] + noise.shot[c] * level == pytest.approx(READ + SHOT * level, rel=0.15)
         assert noise.grain[c] == pytest.approx(GRAIN, rel=0.3)
     assert noise.shared == pytest.approx(0.5, abs=0.15)
+    pictures = presses.pictures.copy()
+    pictures[:, ::20, ::20] *= 0.7  # scratches, which are no grain
+    scratched = dataclasses.replace(presses, pictures=pictures)
+    assert fitting.measure_noise(scratched, _touches(), MINI).shared == pytest.approx(noise.shared, abs=0.25)
