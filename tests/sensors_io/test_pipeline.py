@@ -1,9 +1,7 @@
 """Clips and their batches: shapes and masks by hand, order by seed, resumed = uninterrupted."""
 
-import copy
 import itertools
 
-import cv2
 import numpy as np
 import pytest
 
@@ -51,32 +49,17 @@ class TestClipMemory:
         options = {"batch_size": 3, "seed": 3, "repeat": False} | changes
         return list(clip_batches(store, range(7), SMALL, **options, memory=memory))
 
-    @pytest.mark.parametrize("kept", [0, 2, 7])
-    def test_batches_are_those_without_it(self, store, kept):
+    @pytest.mark.parametrize("kept", [0, 2, 7, 14])
+    def test_batches_are_those_without_it_and_unfelt_clips_are_others(self, store, kept):
         one = sum(a.nbytes for a in self.feed(store, None, batch_size=1)[0].values())
         memory = ClipMemory(SMALL, kept * one)
-        for _ in range(2):
-            for a, b in zip(self.feed(store, memory), self.feed(store, None), strict=True):
-                same(a, b)
-        assert memory.held_bytes == kept * one
-
-    def test_what_is_kept_is_made_once(self):
-        made, memory = [], ClipMemory(SMALL, 10)
-        make = lambda i: lambda: made.append(i) or {"x": np.zeros(4 + i, np.uint8)}
-        for i in (0, 9, 1, 0, 9, 1):
-            assert memory.get(i, make(i))["x"].shape == (4 + i,)
-        assert made == [0, 9, 1, 9]
-
-    def test_random_changes_are_not_kept(self, store):
-        memory = ClipMemory(SMALL, 10**9)
-        self.feed(store, memory, augment=LIVELY)
-        assert memory.held_bytes == 0
-
-    def test_a_contact_felt_and_the_same_unfelt_are_two_clips(self, store):
-        memory = ClipMemory(SMALL, 10**9)
         for felt in (True, False, True, False):
             for a, b in zip(self.feed(store, memory, felt=felt), self.feed(store, None, felt=felt), strict=True):
                 same(a, b)
+        assert min(kept, 7) * one <= memory.held_bytes <= kept * one
+        random = ClipMemory(SMALL, 10**9)
+        self.feed(store, random, augment=LIVELY)
+        assert random.held_bytes == 0  # changes are drawn anew
 
     def test_it_belongs_to_its_clips_and_its_process(self, store):
         other = ClipMemory(ClipConfig(frames=2, image_px=8, view_px=6), 10**9)
@@ -88,9 +71,7 @@ class TestMakeClip:
     def test_it_holds_what_the_schema_says(self):
         clip = make_clip(contact(1), fakes.card(1), SMALL)
         assert clip.frames.shape == (4, 4, 8, 8, 3)
-        assert clip.stream_mask.all()
-        assert clip.frame_mask.all()
-        assert clip.view_mask
+        assert (clip.stream_mask.all(), clip.frame_mask.all(), clip.view_mask) == (True, True, True)
         np.testing.assert_array_equal(clip.view, 10)
         np.testing.assert_array_equal(clip.label, [1, 2, 0, 1])
         for s, sensor in enumerate(SENSORS):
@@ -101,10 +82,7 @@ class TestMakeClip:
 
     def test_images_are_area_means_of_the_frames(self):
         made = contact(0)
-        clip = make_clip(made, fakes.card(0), SMALL)
-        want = cv2.resize(made["xense"].frames[11], (8, 8), interpolation=cv2.INTER_AREA)
-        np.testing.assert_array_equal(clip.frames[1, -1], want)
-        block = make_clip(contact(0), fakes.card(0), ClipConfig(frames=1, image_px=4, view_px=6))
+        block = make_clip(made, fakes.card(0), ClipConfig(frames=1, image_px=4, view_px=6))
         frame = made["xense"].frames[block.frame_index[1, 0]].reshape(4, 4, 4, 5, 3)
         np.testing.assert_allclose(block.frames[1, 0], frame.mean(axis=(1, 3)), atol=0.51)
 
@@ -118,40 +96,28 @@ class TestMakeClip:
     def test_a_missing_sensor_is_masked(self):
         clip = make_clip(contact(0, ("dmtac_x",)), fakes.card(0), SMALL)
         assert clip.stream_mask.tolist() == [False, False, False, True]
-        assert not clip.frame_mask[:3].any()
-        assert not clip.frames[:3].any()
-        assert clip.frames[3].any()
+        assert [frames.any() for frames in clip.frames] == [mask.any() for mask in clip.frame_mask] == [0, 0, 0, 1]
 
-    def test_sensors_of_the_config_set_the_streams(self):
-        clip = make_clip(
-            contact(0), fakes.card(0), ClipConfig(frames=4, image_px=8, sensors=("xense", "gelsight_mini"))
-        )
-        both = make_clip(contact(0), fakes.card(0), SMALL)
-        np.testing.assert_array_equal(clip.frames, both.frames[[1, 0]])
-
-    def test_short_sequences_are_padded(self):
+    def test_short_sequences_are_padded_and_rejected_frames_do_not_enter(self):
         clip = make_clip(contact(0, length=3), fakes.card(0), SMALL)
         assert clip.frame_mask.tolist() == [[True] * 3 + [False]] * 4
         assert clip.frame_index.tolist() == [[0, 1, 2, 0]] * 4
         assert not clip.frames[:, 3].any()
-
-    def test_rejected_frames_do_not_enter(self):
-        flags = np.zeros(12, np.uint32)
-        flags[8:] = int(Flag.NOT_CONVERGED)
+        flags = np.where(np.arange(12) < 8, 0, int(Flag.NOT_CONVERGED)).astype(np.uint32)
         assert make_clip(contact(0, flags=flags), fakes.card(0), SMALL).frame_index.max() == 7
 
     def test_what_is_unknown_is_zero_or_masked(self):
         card = fakes.card(0, view=None, view_depth_mm=None, labels={"hardness": 2})
         clip = make_clip(contact(0, force_n=None), card, SMALL)
-        assert not clip.force_n.any()
-        assert not clip.view_mask
-        assert not clip.view.any()
+        assert (clip.force_n.any(), clip.view_mask, clip.view.any()) == (False, False, False)
         assert clip.label.tolist() == [2, UNKNOWN, UNKNOWN, UNKNOWN]
 
     def test_bad_input_is_named(self):
         refused(SchemaError, r"contact is \{\}", lambda: make_clip({}, fakes.card(0), SMALL))
-        with pytest.raises(SchemaError, match="card is of object 'object_1': the contact is of 'object_0'"):
-            make_clip(contact(0), fakes.card(1), SMALL)
+        refused(SchemaError, "card is of object 'object_1': the", make_clip, contact(0), fakes.card(1), SMALL)
+        mirror = AugmentConfig(mirror=1)
+        said = r"rng is None: .* needs a source of randomness; pass one"
+        refused(SchemaError, said, lambda: make_clip(contact(0), fakes.card(0), SMALL, augment=mirror))
         refused(SchemaError, "frames is 0: must be ≥ 1", ClipConfig, frames=0)
         refused(SchemaError, "each once", ClipConfig, sensors=("xense", "xense"))
 
@@ -173,14 +139,6 @@ class TestAugmentedClip:
         for name in ("frame_index", "frame_mask", "view", "label"):
             np.testing.assert_array_equal(getattr(mirrored, name), getattr(plain, name))
 
-    def test_exposure_leaves_fields_alone(self):
-        config = AugmentConfig(exposure_stops=1, white_balance_stops=0.5)
-        plain = make_clip(contact(0), fakes.card(0), SMALL)
-        bright = make_clip(contact(0), fakes.card(0), SMALL, augment=config, rng=RNG())
-        np.testing.assert_array_equal(bright.frames[2], plain.frames[2])
-        assert all((bright.frames[s] != plain.frames[s]).any() for s in (0, 1, 3))
-        np.testing.assert_array_equal(bright.force_n, plain.force_n)
-
     def test_a_dropped_frame_is_masked_and_holds_nothing(self):
         config = AugmentConfig(frame_dropout=0.6)
         clip = make_clip(contact(0), fakes.card(0), SMALL, augment=config, rng=RNG())
@@ -190,17 +148,15 @@ class TestAugmentedClip:
             assert not getattr(clip, name)[~clip.frame_mask].any()
         assert clip.frames[clip.frame_mask].reshape(clip.frame_mask.sum(), -1).any(1).all()
 
-    def test_no_randomness_without_a_source(self):
-        with pytest.raises(SchemaError, match=r"rng is None: .* needs a source of randomness; pass one"):
-            make_clip(contact(0), fakes.card(0), SMALL, augment=AugmentConfig(mirror=1))
-
 
 def iter_state(batches, read):
-    """The state of an iterator after some batches."""
+    """The state of an iterator after some batches; what it reads afterwards does not matter."""
     iterator = iter(batches)
     for _ in range(read):
         next(iterator)
-    return iterator.get_state()
+    state = iterator.get_state()
+    next(iterator)
+    return state
 
 
 class TestClipBatches:
@@ -236,18 +192,12 @@ class TestClipBatches:
         assert not any((clip == other).all() for clip in first for other in later)  # another change each time
         same(plain[0], frames(augment=AugmentConfig())[0])
 
-    @pytest.mark.parametrize("stop", [0, 1, 2, 3, 6, 7])
+    @pytest.mark.parametrize("stop", [0, 1, 2, 3, 7])
     @pytest.mark.parametrize("augment", [None, LIVELY], ids=["plain", "changed"])
     def test_resumed_equals_uninterrupted(self, store, stop, augment):
-        whole = iter(self.batches(store, augment=augment))
-        want = [next(whole) for _ in range(9)]
-        first = iter(self.batches(store, augment=augment))
-        for _ in range(stop):
-            next(first)
-        state = first.get_state()
-        next(first)  # what is read after the state was taken does not matter
+        want = list(itertools.islice(self.batches(store, augment=augment), 9))
         second = iter(self.batches(store, augment=augment))
-        second.set_state(state)
+        second.set_state(iter_state(self.batches(store, augment=augment), stop))
         for batch in want[stop:]:
             same(next(second), batch)
 
@@ -259,15 +209,13 @@ class TestClipBatches:
         assert [b["contact"].tolist() for b in some] == [[5, 1]]
 
     def test_worker_processes_change_nothing_but_speed_and_resume_exactly(self, store):
-        alone = iter(self.batches(store, augment=LIVELY))
-        first, second = (iter(self.batches(store, workers=2, augment=LIVELY)) for _ in range(2))
+        want = list(itertools.islice(self.batches(store, augment=LIVELY), 4))
+        feeds = first, second = [iter(self.batches(store, workers=2, augment=LIVELY)) for _ in range(2)]
         try:
-            same(next(first), next(alone))
+            same(next(first), want[0])
             second.set_state(first.get_state())
-            for _ in range(3):
-                want = next(alone)
-                same(next(first), want)
-                same(next(second), want)
+            for batch, feed in itertools.product(want[1:], feeds):
+                same(next(feed), batch)
         finally:
             first.close()
             second.close()
@@ -285,23 +233,11 @@ class TestClipBatches:
             part.set_state(iter_state(self.batches(store, **options), 5))
             same(next(part), {name: x[own] for name, x in want[5].items()})
 
-    def test_a_machine_reads_no_rows_but_its_own(self, store, monkeypatch):
-        read, fresh = [], copy.copy(store)  # threads that read ahead for earlier tests may still read the other one
-        monkeypatch.setattr(fresh, "contact", lambda i, **options: read.append(i) or store.contact(i, **options))
-        list(self.batches(fresh, own=[1], shuffle=False, repeat=False, drop_remainder=True))
-        assert read == [1, 4]
-
     @pytest.mark.parametrize("own", [[], [1, 0], [0, 3], [-1]])
     def test_rows_that_a_batch_does_not_have_are_named(self, store, own):
         with pytest.raises(SchemaError, match=r"own is .* of batches of 3, all whole: must be ascending rows 0\.\.2"):
             self.batches(store, own=own)
         refused(SchemaError, "the last perhaps smaller", self.batches, store, own=[0], repeat=False)
-
-    def test_bad_indices_are_named(self, store):
-        with pytest.raises(SchemaError, match="indices is empty: a pipeline needs at least one contact"):
-            clip_batches(store, [], SMALL, batch_size=2, seed=0)
-        with pytest.raises(SchemaError, match=r"indices reach 0\.\.7: must lie in 0\.\.6"):
-            clip_batches(store, [0, 7], SMALL, batch_size=2, seed=0)
 
 
 def test_readers_that_join_or_leave_change_shares_and_not_the_epoch(store):

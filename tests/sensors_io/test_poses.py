@@ -51,20 +51,6 @@ def test_every_pose_is_found_once_and_tells_bias_and_weight():
     assert zero.model.rms_n < 0.01
 
 
-def test_a_sensor_that_never_rests_has_no_pose():
-    times, force, moment, _ = turned(hold_s=0.1, turn_s=1.0)
-    assert found_in(times, force, moment) == []
-    rng = np.random.default_rng(1)
-    assert found_in(times, force + rng.normal(0, 0.2, force.shape), moment) == []
-
-
-def test_the_same_pose_held_again_is_not_another():
-    refused(ValueError, "still_n is 0", PoseConfig, still_n=0)
-    times, force, moment, _ = turned(count=1, hold_s=5)
-    assert len(found_in(times, force, moment)) == 1
-    refused(ForceError, "span no sphere", lambda: fit_poses(found_in(times, force, moment)))
-
-
 def test_a_zero_comes_back_from_its_file(tmp_path):
     zero = fit_poses(found_in(*turned()[:3]))
     path = tmp_path / "g.json"

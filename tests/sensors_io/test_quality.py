@@ -3,7 +3,6 @@
 import dataclasses
 
 import numpy as np
-import pytest
 
 from sensors_io import quality
 from sensors_io.quality import QualityConfig
@@ -53,9 +52,8 @@ def test_odd_but_legal_sequences_are_named() -> None:
     pictures = np.arange(3 * 4 * 4 * 3, dtype=np.uint8).reshape(3, 4, 4, 3)
     key = ContactKey(object_id="a", site=0, motion="press", trial=0)
     time, flags = np.arange(3) * 10, np.zeros(3, np.uint32)
-    whole = Sequence(
-        key=key, sensor="xense", frames=pictures, host_time_ns=time, phase=np.ones(3, np.uint8), flags=flags
-    )
+    arrays = {"frames": pictures, "host_time_ns": time, "phase": np.ones(3, np.uint8), "flags": flags}
+    whole = Sequence(key=key, sensor="xense", **arrays)
     cases = {
         (): {},
         ("all pictures black",): {"frames": np.zeros_like(pictures)},
@@ -101,8 +99,3 @@ def test_a_sequence_is_judged_by_what_it_holds() -> None:
     again = quality.judged(sequence, found)
     assert again.flags[1] == int(Flag.NO_CONTACT | Flag.INCOMPLETE)
     assert not sequence.flags.any()
-
-
-@pytest.mark.parametrize("wrong", [{"unstable_window": 1}, {"gap_periods": 1.0}, {"saturated_level": 0}])
-def test_limits_that_mean_nothing_are_refused(wrong: dict) -> None:
-    refused(ValueError, f"{next(iter(wrong))} is", QualityConfig, **wrong)

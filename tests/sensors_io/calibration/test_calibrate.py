@@ -10,7 +10,6 @@ import pytest
 from sensors_io.__main__ import main
 from sensors_io.calibration.calibrate import CalibrateConfig, calibrate
 from sensors_io.calibration.presses import BallPresses
-from sensors_io.fields.sources import read_picture
 from sensors_io.fields.types import Calibration, CalibrationError
 from tests.sensors_io.calibration.synthetic import press_ball, spread_touches
 from tests.sensors_io.checks import refused
@@ -105,36 +104,3 @@ def test_presses_that_cannot_calibrate_are_refused(presses: BallPresses) -> None
     ):
         wrong = dataclasses.replace(presses, **change)
         refused(CalibrationError, said, calibrate, wrong, names(wrong), "x", QUICK)
-
-
-@pytest.mark.slow
-def test_a_picture_without_contact_is_left_out_and_named(presses: BallPresses) -> None:
-    blank = dataclasses.replace(presses, pictures=np.concatenate([presses.pictures, presses.background[None]]))
-    _, report = calibrate(blank, names(blank), "x", QUICK)
-    assert [(press.name, "shows no contact" in press.reason) for press in report.left_out] == [("press 12", True)]
-    assert len(report.kept) == 12
-
-
-def test_the_command_says_in_one_line_what_is_missing(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture) -> None:
-    command = ["calibrate", str(tmp_path), "--background", str(CLIPS / "background.png"), "--ball-diameter-mm", "6"]
-    assert main([*command, "--mm-per-px", "0.1", "--out", str(tmp_path / "out.npz")]) == 1
-    assert "holds no picture" in capsys.readouterr().err
-    assert not list(tmp_path.glob("*.npz"))
-
-
-def test_a_changed_calibration_is_refused(real: pathlib.Path, tmp_path: pathlib.Path) -> None:
-    with np.load(real) as file:
-        arrays = dict(file)
-    arrays["weights"] = arrays["weights"] * 2
-    np.savez(tmp_path / "changed.npz", **arrays)
-    refused(CalibrationError, "was changed", Calibration.load, tmp_path / "changed.npz")
-    (tmp_path / "text.npz").write_text("no zip")
-    refused(CalibrationError, "is no calibration", Calibration.load, tmp_path / "text.npz")
-
-
-def test_a_calibration_survives_the_disk(real: pathlib.Path, tmp_path: pathlib.Path) -> None:
-    made = Calibration.load(real)
-    made.save(tmp_path / "copy.npz")
-    assert Calibration.load(tmp_path / "copy.npz").hash == made.hash
-    assert [p.name for p in tmp_path.iterdir()] == ["copy.npz"]
-    np.testing.assert_array_equal(made.background, read_picture(CLIPS / "background.png"))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sensors_io.calibration.coverage import coverage
+from sensors_io.calibration.coverage import Coverage, coverage
 from sensors_io.calibration.presses import Touches
 
 
@@ -19,6 +19,13 @@ def test_the_next_place_is_the_empty_corner_within_the_margin() -> None:
     assert seen.next_px == pytest.approx((83, 53), abs=1.0)
     assert seen.covered[15, 15]
     assert not seen.covered[55, 85]
+
+
+def test_places_have_the_names_of_thirds() -> None:
+    named = {(29, 19): "upper left", (30, 19): "upper middle", (60, 0): "upper right", (29, 20): "middle left"}
+    named |= {(30, 39): "middle", (0, 40): "lower left", (59, 40): "lower middle", (90, 60): "lower right"}
+    for place, name in named.items():
+        assert Coverage(covered=np.zeros((60, 90), bool), share=0.0, next_px=place).where() == f"the {name}"
 
 
 def test_presses_all_over_cover_everything() -> None:

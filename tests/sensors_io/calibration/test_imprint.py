@@ -9,16 +9,6 @@ from sensors_io.calibration.presses import indentation
 RADIUS, CONTACT = 3.0, 1.5
 
 
-def test_without_blur_it_is_the_indentation() -> None:
-    x = np.linspace(-3, 3, 61)
-    n_x, n_y, depth = Imprint(RADIUS, 0.0)(x, 0 * x, CONTACT)
-    u, slope, _ = indentation(x, 0 * x, CONTACT, RADIUS)
-    off_rim = np.abs(np.abs(x) - CONTACT) > 0.1
-    np.testing.assert_allclose(n_x[off_rim], (slope / np.sqrt(1 + slope**2))[off_rim], atol=0.01)
-    np.testing.assert_allclose(depth, u, atol=0.01)
-    assert not n_y.any()
-
-
 def test_blur_leaves_the_linear_inside_and_smooths_the_rim() -> None:
     x = np.array([0.3, 0.6, 0.9, 1.5])
     normal = Imprint(RADIUS, 0.2)(x, 0 * x, CONTACT)[0]

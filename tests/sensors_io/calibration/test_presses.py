@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sensors_io.calibration.presses import indentation, shrink
+from sensors_io.calibration.published import reduced
 from sensors_io.fields.types import CalibrationError
 from tests.sensors_io.calibration.synthetic import press_ball, spread_touches
 from tests.sensors_io.checks import refused
@@ -38,6 +39,11 @@ def test_slopes_are_the_gradient_of_depth_across_the_edge() -> None:
     edge = np.abs(np.hypot(x, 0.3) - CONTACT) < 0.01
     np.testing.assert_allclose(slope[~edge], numeric[~edge], atol=2e-3)
     assert np.abs(np.diff(slope)).max() < 0.05
+
+
+def test_published_pictures_become_at_most_480_pixels_wide() -> None:
+    assert reduced(np.zeros((90, 1000, 3), np.uint8)).shape == (30, 333, 3)
+    assert reduced(np.zeros((90, 480, 3), np.uint8)).shape == (90, 480, 3)
 
 
 def test_shrinking_takes_means() -> None:

@@ -1,15 +1,10 @@
 """`snap` on a replayed camera: rest picture, guided presses, and a calibration from nothing else."""
 
-import pathlib
-
-import cv2
 import numpy as np
 import pytest
 
-from sensors_io.__main__ import main
 from sensors_io.calibration.guide import GuideConfig, PressGuide
 from sensors_io.calibration.presses import BallPresses
-from sensors_io.fields.types import Calibration
 from tests.sensors_io.calibration.synthetic import press_ball, spread_touches
 
 TOUCHES = spread_touches(10)
@@ -51,30 +46,3 @@ def test_a_moving_or_shallow_or_saturated_contact_is_not_taken(presses: BallPres
     brighter = lambda picture: np.minimum(picture * 2.1, 255).astype(np.uint8)
     guide = PressGuide(presses.radius_mm, presses.mm_per_px, QUICK, brighter(presses.background))
     assert "saturated" in guide.look(brighter(presses.pictures[0])).prompt
-
-
-def test_snap_then_calibrate_from_a_replayed_camera(
-    presses: BallPresses, tmp_path: pathlib.Path, capsys: pytest.CaptureFixture
-) -> None:
-    (tmp_path / "camera").mkdir()
-    for i, frame in enumerate(frames_of(presses)):
-        cv2.imwrite(str(tmp_path / "camera" / f"{i:03d}.png"), cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
-    ball = ["--ball-diameter-mm", "6", "--mm-per-px", "0.15"]
-    out = tmp_path / "mini"
-    command = ["snap", "--out", str(out), *ball, "--port", "0", "--presses", "10", "--cover", "0.1"]
-    command += ["--rest-frames", "3", "--steady-frames", "2"]
-    replay = ["replay", "--path", str(tmp_path / "camera"), "--rate-hz", "500"]
-    assert main([*command, *replay]) == 0
-    assert f"next: python -m sensors_io calibrate {out / 'presses'}" in capsys.readouterr().out
-    assert len(list((out / "presses").glob("*.png"))) == 10
-    assert main([*command, *replay]) == 0  # goes on with what it has: nothing is missing
-    made = [str(out / "presses"), "--background", str(out / "background.png"), *ball, "--out", str(tmp_path / "c.npz")]
-    assert main(["calibrate", *made, "--folds", "2", "--repeats", "1"]) == 0
-    assert Calibration.load(tmp_path / "c.npz").made_from["held-out presses"] == 10
-
-
-def test_snap_needs_a_pitch(tmp_path: pathlib.Path, presses: BallPresses, capsys: pytest.CaptureFixture) -> None:
-    cv2.imwrite(str(tmp_path / "0.png"), presses.background)
-    command = ["snap", "--out", str(tmp_path / "o"), "--ball-diameter-mm", "6", "--port", "0"]
-    assert main([*command, "replay", "--path", str(tmp_path)]) == 1
-    assert "mm_per_px is None" in capsys.readouterr().err

@@ -36,8 +36,3 @@ def test_a_drifted_sensor_reads_zero_afterwards(monkeypatch, capsys):
     rows = [line for line in capsys.readouterr().out.splitlines() if "tac3d" in line]
     assert len(rows) == 2
     assert all("+0.000 +0.000 -0.400" in row and row.count("+0.000 +0.000 +0.000") == 1 for row in rows)
-
-
-def test_a_device_without_a_zero_is_named(tmp_path, capsys):
-    assert cli.main(["zero", "replay", "--path", str(tmp_path)]) == 1
-    assert "gelsight_mini has no zero to take: must be tac3d or netft" in capsys.readouterr().err

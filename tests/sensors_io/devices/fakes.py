@@ -1,5 +1,8 @@
 """Devices and sources that do what a script says."""
 
+import contextlib
+import threading
+
 import numpy as np
 
 from sensors_io.devices.base import Identity, Sample
@@ -58,3 +61,27 @@ class Scripted:
 def sample(index=None, time_ms=0, **rest):
     """A sample at some time; without a frame unless given one."""
     return Sample(host_time_ns=time_ms * MS, index=index, **rest)
+
+
+@contextlib.contextmanager
+def sent(sender, *messages):
+    """Messages sent again and again; those that are functions are made for each number."""
+    done = threading.Event()
+
+    def send():
+        number = 0
+        while not done.is_set():
+            for message in messages:
+                number += 1
+                for datagram in message(number):
+                    with contextlib.suppress(ConnectionRefusedError):  # nobody listens yet
+                        sender.send(datagram)
+                done.wait(0.005)
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()

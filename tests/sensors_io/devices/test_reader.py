@@ -51,14 +51,6 @@ def indices(reader):
             return
 
 
-def test_next_gives_all_samples_in_order_and_then_the_reason_of_the_end():
-    intake = pumped(Scripted([sample(i) for i in range(5)]))
-    assert [s.index for s in drain(intake)] == [0, 1, 2, 3, 4]
-    with pytest.raises(StreamEndedError):
-        intake.next(0.0)
-    assert intake.counts.unaccounted == 0
-
-
 def test_an_overflowing_ring_counts_what_it_overwrites_and_says_so():
     intake = pumped(Scripted([sample(i) for i in range(10)]), capacity=4)
     assert intake.overloaded
@@ -144,14 +136,6 @@ def test_a_silent_device_is_taken_as_lost():
     assert (counts.timeouts, counts.disconnects, counts.reconnects) == (3, 1, 1)
 
 
-@pytest.mark.parametrize(("period_s", "lost"), [(2.0, False), (None, True)])
-def test_a_slow_device_and_one_just_opened_get_more_time(period_s, lost):
-    """Three periods of a picture every two seconds; five seconds for a first sample."""
-    clock, script = JumpingClock(), [*[SILENCE] * 4, sample(0), *[SILENCE] * 5, sample(1)]
-    counts = pumped(Slow(script, clock, period_s=period_s), clock=clock, timeout_s=1.0).counts
-    assert (counts.disconnects > 0) == lost
-
-
 def test_a_counter_that_restarts_on_reconnecting_leaves_the_loss_to_the_clock():
     script = [sample(4, 40), sample(5, 50), DeviceLostError("x"), sample(0, 110), sample(1, 120)]
     counts = pumped(Scripted(script, period_s=0.01)).counts
@@ -215,11 +199,6 @@ def test_an_absent_device_and_a_bug_in_a_driver_reach_the_caller():
         with pytest.raises(DeviceLostError, match="ZeroDivisionError") as failed:
             reader.next(5.0)
     assert isinstance(failed.value.__cause__, ZeroDivisionError)
-
-
-@pytest.mark.parametrize("field", ["capacity", "timeout_s", "give_up_after_s"])
-def test_configs_are_checked(field):
-    refused(ValueError, f"{field} is 0: must be > 0", ReaderConfig, **{field: 0})
 
 
 def test_reopening_forgets_nothing_of_the_first_identity():

@@ -41,11 +41,6 @@ def test_the_reader_is_the_formula(degree: int, position_degree: int) -> None:
     np.testing.assert_allclose(found, wanted, atol=1e-5)
 
 
-def test_no_change_is_no_slope() -> None:
-    background = np.full((12, 16, 3), 100, np.uint8)
-    assert not np.any(SlopeReader(random_map(3, 2), background)(background))
-
-
 def test_change_is_in_units_of_64_levels_and_signed() -> None:
     background = np.full((12, 16, 3), 100, np.uint8)
     red, green, blue = change(

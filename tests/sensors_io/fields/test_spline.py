@@ -61,12 +61,6 @@ def test_leave_one_out_is_that_of_a_fit_without_the_point():
     assert not spline.inconsistent(field, EVERY, 1.01 * error)[9]
 
 
-def test_bending_is_zero_for_affine_fields_only():
-    spline = ThinPlate(POINTS)
-    assert spline.bending(POINTS * 0.1 + 3, EVERY) == pytest.approx(0, abs=1e-8)
-    assert spline.bending(DISPLACEMENT, EVERY) > 1
-
-
 def test_dense_field_is_the_spline_at_every_pixel():
     spline = ThinPlate(POINTS)
     smooth = np.column_stack([np.sin(POINTS[:, 0] / 40), np.cos(POINTS[:, 1] / 50)]).astype(np.float32)
@@ -92,15 +86,3 @@ def test_a_lattice_shifted_in_part_is_torn_at_the_border():
     assert neighbours.torn(shifted, every, 0.5)
     assert not neighbours.torn(0.3 * shifted, every, 0.5)
     assert [p.sum() for p in pieces] == sorted((np.sum(points[:, 0] <= 100), np.sum(points[:, 0] > 100)), reverse=True)
-
-
-def test_the_ring_around_a_piece():
-    points = gels.lattice()
-    ring = Neighbours(points).beside(points[:, 0] < 40)
-    assert 40 < points[ring, 0].min() <= points[ring, 0].max() < 90
-
-
-def test_few_points_are_all_neighbours():
-    square = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1]])
-    (piece,) = Neighbours(square).pieces(np.zeros((4, 2)), np.ones(4, bool), 0.1)
-    assert piece.all()

@@ -40,13 +40,6 @@ def test_points_are_found_to_a_tenth_of_a_pixel(tracker, peak):
     assert error.max() < 0.25
 
 
-def test_nothing_drifts(tracker):
-    for i in range(60):
-        follow(6 * np.sin(i / 5), tracker, seed=i)
-    error = np.hypot(*(follow(0.0, tracker, seed=99).points_px - POINTS[INNER]).T)
-    assert np.median(error) < 0.03
-
-
 def test_a_jump_past_half_a_pitch_is_caught(tracker):
     """Half a pitch is 10 px: from rest, Lucas–Kanade takes some dots for their neighbours."""
     found = follow(18.0, tracker)
@@ -64,18 +57,6 @@ def test_lost_dots_are_flagged_placed_and_found_again(tracker):
     assert np.array_equal(~found.found, lost)
     assert error[lost].max() < 1.0
     assert follow(peak, tracker).found.all()
-
-
-def test_a_black_picture_finds_nothing_and_the_next_one_everything(tracker):
-    black = tracker.track(np.zeros_like(REST))
-    assert (black.found.any(), black.reseeded) == (False, True)
-    assert follow(2.0, tracker).found.all()
-
-
-def test_a_picture_of_a_third_of_the_light_is_followed(tracker):
-    found = tracker.track(gels.exposed(0.3 * gels.dots(moved(POINTS, 3.0))))
-    assert found.found.all()
-    assert np.hypot(*(found.points_px - moved(POINTS, 3.0)[INNER]).T).max() < 0.15
 
 
 def test_the_spread_follows_the_noise_as_documented():
@@ -141,6 +122,8 @@ def test_lost_markers_flag_the_frame_and_their_nodes():
 def test_a_dense_pattern_is_read_too():
     rest = gels.speckle()
     reader = DeformationReader(gels.rgb(gels.exposed(rest)), mm_per_px=0.1, shape=(16, 20))
+    x, y = (np.unique(side) for side in reader.tracker.points_px.T)  # windows of 17 px, 12 px apart, a pixel inside
+    np.testing.assert_allclose([*x[[0, -1]], *y[[0, -1]], len(x), len(y)], [9, 190, 9, 150, 16, 13])
     read = reader.read(gels.rgb(gels.exposed(np.roll(rest, (3, -2), (0, 1)), seed=1)))
     inner = read.displacement_mm[2:-2, 2:-2]
     np.testing.assert_allclose(inner, np.broadcast_to([-0.2, 0.3], inner.shape), atol=0.01)
@@ -150,8 +133,3 @@ def test_a_dense_pattern_is_read_too():
 def test_a_bare_gel_is_refused(rest):
     with pytest.raises(NoPatternError, match="neither dots nor a dense pattern"):
         DeformationReader(gels.rgb(gels.exposed(rest)), mm_per_px=0.1)
-
-
-def test_pictures_must_be_rgb_of_known_scale():
-    refused(ValueError, "convert it to RGB", DeformationReader, REST, mm_per_px=0.1)
-    refused(ValueError, "mm_per_px is 0", lambda: DeformationReader(gels.rgb(REST), mm_per_px=0.0))

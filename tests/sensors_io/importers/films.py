@@ -29,17 +29,10 @@ def film(path, frames=12, size=(24, 32), rate=25.0):
 
 
 def entry(name, /, videos=2, **changes):
-    values = {
-        "object": name,
-        "name": f"a {name}",
-        "split": "train",
-        "hardness": 1,
-        "roughness": 0,
-        "bumps": 2,
-        "material": "rubber",
-        "videos": [f"{name}_{k}.avi" for k in range(videos)],
-    }
-    return values | changes
+    """An object of the list; `videos` are names, or how many there are."""
+    names = videos if isinstance(videos, list) else [f"{name}_{k}.avi" for k in range(videos)]
+    told = {"object": name, "name": f"a {name}", "split": "train", "material": "rubber", "videos": names}
+    return told | {"hardness": 1, "roughness": 0, "bumps": 2} | changes
 
 
 def folder(path, *entries):

@@ -7,21 +7,12 @@ import numpy as np
 import pytest
 
 from sensors_io.importers.catalogue import Catalogue, Listed, Taken, fingerprint, import_catalogue
-from sensors_io.importers.estimate_modulus import list_estimate_modulus
-from sensors_io.importers.feelanyforce import FeelAnyForceConfig, list_feelanyforce
-from sensors_io.importers.keep import ImportConfig, ImportSourceError, Keep, Shares, Skip, UnreadableError
-from sensors_io.importers.octopi import list_octopi
-from sensors_io.importers.tac3d import list_tac3d
-from sensors_io.importers.tacquad import list_tacquad
-from sensors_io.importers.touch_and_go import list_touch_and_go
-from sensors_io.importers.tvl import list_tvl
-from sensors_io.importers.vtv150k import VTVConfig, list_vtv150k
-from sensors_io.importers.ycb_slide import list_ycb_slide
+from sensors_io.importers.keep import ImportConfig, ImportSourceError, Keep, Skip, UnreadableError
 from sensors_io.records import RecordsExistError, RecordStore
 from sensors_io.schema import ATTRIBUTES, ContactKey
 from tests.sensors_io import fakes
 from tests.sensors_io.checks import refused
-from tests.sensors_io.importers.films import EVERYTHING, imported, picture
+from tests.sensors_io.importers.films import imported
 
 
 def take(n, key):
@@ -89,15 +80,6 @@ def test_nothing_readable_is_an_error_and_leaves_nothing(tmp_path):
     refused(RecordsExistError, "made by config 'c0ffee', not 'abcd'", import_catalogue, other, tmp_path)
 
 
-def test_the_view_of_the_first_contact_is_stored(tmp_path):
-    path = picture(tmp_path / "in" / "view.png", shape=(480, 640))
-    assert imported(catalogue(3, view=path), tmp_path / "out")[1].objects["object_0"].view.shape == (240, 320, 3)
-    path.write_bytes(b"broken")
-    report, store = imported(catalogue(3, view=path), tmp_path / "again")
-    assert Skip(name="view.png", reason="view does not open as a picture") in report.skipped
-    assert store.objects["object_0"].view is None
-
-
 def test_the_fingerprint_is_of_config_names_sizes_and_listings(tmp_path):
     def now(config=Keep()):  # noqa: B008
         return fingerprint(tmp_path, [tmp_path / "a", tmp_path / "gone"], config, [tmp_path / "list"])
@@ -123,21 +105,3 @@ def test_bad_options_are_named():
     refused(ImportSourceError, "stride is 0: must be ≥ 1; raise it", ImportConfig, stride=0)
     refused(ImportSourceError, "height is -1: must be ≥ 0", ImportConfig, height=-1)
     refused(ImportSourceError, "max_frames is -1", ImportConfig, max_frames=-1)
-
-
-@pytest.mark.parametrize(
-    ("listing", "config", "expected"),
-    [
-        (list_estimate_modulus, EVERYTHING, r"<object>_<n>.avi with <object>_<n>_forces.pkl"),
-        (list_feelanyforce, FeelAnyForceConfig(), r"<table>.csv with the columns tactile, depth, FT"),
-        (list_octopi, Keep(), r"<sample>/data.json and <sample>/tactile"),
-        (list_tac3d, Shares(), r"<name>_<serial>.npz"),
-        (list_tacquad, EVERYTHING, r"one of contact_indoor.csv, .* with its data_indoor"),
-        (list_touch_and_go, EVERYTHING, r"one of label.txt, .* and dataset/<session>/gelsight_frame"),
-        (list_tvl, EVERYTHING, r"train.csv or test.csv, in it or in data1"),
-        (list_vtv150k, VTVConfig(sensor="digit"), r"<object>_<n>.mp4"),
-        (list_ycb_slide, EVERYTHING, r"<object>/dataset_<k>/frames/frame_<7 digits>.jpg"),
-    ],
-)
-def test_a_wrong_directory_says_what_was_expected(tmp_path, listing, config, expected):
-    refused(ImportSourceError, f"expected {expected}", listing, tmp_path, config)

@@ -41,13 +41,6 @@ def test_grasps_whose_files_do_not_fit_are_left_out_by_name(tmp_path):
     grasp(source, "nameless", force=np.ones(12))
     report, store = imported(list_estimate_modulus(source, EVERYTHING), tmp_path / "out")
     assert len(store) == 1
-    found = {skip.name: skip.reason for skip in report.skipped}
-    assert found.pop("ball_4.avi").startswith("ball_4_forces.pkl holds no numbers")
-    assert found == {
-        "ball_1_other.avi": "is the finger without force",
-        "nameless.avi": "is not named <object>_<n>",
-        "ball_2.avi": "ball_2_forces.pkl holds (11,) values: must be 12 finite ones, one per frame",
-        "ball_3.avi": "ball_3_forces.pkl is absent",
-        "ball_1_widths.pkl": "ball_1_widths.pkl is absent",
-    }
+    videos = {f"{name}.avi" for name in ("ball_1_other", "nameless", "ball_2", "ball_3", "ball_4")}
+    assert {skip.name for skip in report.skipped} == {*videos, "ball_1_widths.pkl"}
     assert "gripper_width_m" not in store.contact(0)["gelsight_wedge"].camera

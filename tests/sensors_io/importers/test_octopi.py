@@ -5,10 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from sensors_io.importers.keep import Skip
 from sensors_io.importers.octopi import level_of, list_octopi
-from sensors_io.schema import UNKNOWN, Flag
-from tests.sensors_io.importers.films import EVERYTHING, cut, imported, picture
+from sensors_io.schema import UNKNOWN
+from tests.sensors_io.importers.films import EVERYTHING, imported, picture
 
 POTATO = {
     "object_id": "physiclear_potato",
@@ -53,31 +52,6 @@ def test_samples_become_records(source, tmp_path):
     np.testing.assert_allclose(sequence.host_time_ns, np.array([2, 3, 6]) / 30 * 1e9, atol=1)
     assert sequence.camera["exploratory_procedure"] == "pressing"
     assert sequence.force_n is None
-
-
-def test_a_cut_picture_is_left_out_and_marked(source, tmp_path):
-    cut(source / "physiclear_2" / "tactile" / "0000000004.jpg")
-    report, store = imported(list_octopi(source, EVERYTHING), tmp_path / "out")
-    assert report.skipped == (Skip(name="tactile/0000000004.jpg", reason="is cut off"),)
-    assert store.contact(1)["gelsight_mini"].flags.tolist() == [0, int(Flag.TIME_GAP)]
-
-
-@pytest.mark.parametrize(
-    ("data", "reason"),
-    [
-        ("{", "data.json: "),
-        ({"object": "nothing"}, "data.json: 'object_id'"),
-        (POTATO | {"split": "dev"}, "split is 'dev'"),
-        (POTATO | {"properties": {"hardness": 11}}, "rating is 11.0: must lie in 0..10"),
-        (POTATO | {"properties": {"hardness": 1.0}}, "contradicts an earlier sample of potato"),
-    ],
-)
-def test_a_sample_without_a_usable_object_is_skipped(source, data, reason):
-    sample(source, "physiclear_99", data)
-    catalogue = list_octopi(source, EVERYTHING)
-    assert len(catalogue.contacts) == 3
-    assert [skip.name for skip in catalogue.skipped] == ["physiclear_99"]
-    assert reason in catalogue.skipped[0].reason
 
 
 def test_ratings_are_cut_into_thirds():

@@ -2,10 +2,8 @@
 
 import pytest
 
-from sensors_io.importers.keep import ImportSourceError, Skip
 from sensors_io.importers.tvl import list_tvl
-from tests.sensors_io.checks import refused
-from tests.sensors_io.importers.films import EVERYTHING, cut, imported, picture
+from tests.sensors_io.importers.films import EVERYTHING, imported, picture
 
 DIGIT, WEBCAM = (320, 240), (90, 160)
 HEAD = "url,tactile,tactile_background,caption\n"
@@ -41,31 +39,3 @@ def test_trajectories_become_records(source, tmp_path):
     assert (whole.camera["turned_round"], swapped.camera["turned_round"]) == (0, 2)
     for card in store.objects.values():
         assert card.view.shape == (240, 427, 3)
-
-
-def test_one_part_alone_and_a_cut_picture(source, tmp_path):
-    cut(source / "data1" / "0-1702507215.6" / "tactile" / "10-0.02.png")
-    report, store = imported(list_tvl(source / "data1", EVERYTHING), tmp_path / "out")
-    assert report.skipped == (Skip(name="tactile/10-0.02.png", reason="is cut off"),)
-    assert {k.object_id for k in store.contacts} == {"0-1702507215.6", "1-1702507300.1"}
-
-
-def test_a_row_that_leads_elsewhere_is_skipped(source):
-    with (source / "data1" / "train.csv").open("a") as file:
-        file.write("../a/b,../a/b,,x\nshort\na/vision/b.jpg,a/tactile/b.jpg,,x\n")
-    catalogue = list_tvl(source, EVERYTHING)
-    reason = "is no <trajectory>/{tactile,vision}/<i>-<gap>.jpg"
-    assert [(skip.name, skip.reason) for skip in catalogue.skipped] == [
-        ("data1/train.csv: ../a/b", reason),
-        ("data1/train.csv: ", reason),
-        ("data1/train.csv: a/tactile/b.jpg", reason),
-    ]
-
-
-def test_wrong_tables_are_named(source):
-    table = source / "data1" / "train.csv"
-    table.write_text("a,b\n1,2\n")
-    said = r"train.csv has the columns \['a', 'b'\]: must have url, tactile"
-    refused(ImportSourceError, said, list_tvl, source, EVERYTHING)
-    table.write_bytes(b"\xff\xfe\xff")
-    refused(ImportSourceError, "train.csv cannot be read", list_tvl, source, EVERYTHING)

@@ -2,7 +2,6 @@
 
 import tracemalloc
 
-import cv2
 import numpy as np
 import pytest
 
@@ -51,44 +50,9 @@ def test_shrinking_keeps_the_aspect_ratio_and_takes_area_means(tmp_path):
     np.testing.assert_allclose(small.frames, every.frames.reshape(3, 12, 2, 16, 2, 3).mean(axis=(2, 4)), atol=0.51)
 
 
-@pytest.mark.parametrize("data", [None, b"", b"no video at all" * 99])
-def test_broken_files_are_named(tmp_path, data):
-    path = tmp_path / "a.avi"
-    if data is not None:
-        path.write_bytes(data)
-    refused(VideoError, "does not open as a video", read_video, path, Keep(**WHOLE))
-
-
 def test_a_film_cut_short_is_named(tmp_path):
     said = r"is cut off: \d+ of 40 frames|holds no frame|does not open"
     refused(VideoError, said, read_video, cut(film(tmp_path / "a.avi", 40)), Keep(**WHOLE))
-
-
-@pytest.mark.parametrize(
-    ("stated", "message"),
-    [
-        ({cv2.CAP_PROP_FPS: 0.0}, "states a frame rate of 0.0"),
-        ({cv2.CAP_PROP_FPS: float("nan")}, "states a frame rate of nan"),
-        ({cv2.CAP_PROP_FRAME_COUNT: 13.0}, "is cut off: 12 of 13 frames"),
-    ],
-)
-def test_what_the_container_states_is_checked(tmp_path, monkeypatch, stated, message):
-    film(tmp_path / "a.avi", 12)
-
-    opened = cv2.VideoCapture
-
-    class Capture:  # not a subclass: OpenCV's own class does not survive being one
-        def __init__(self, name):
-            self.capture = opened(name)
-
-        def __getattr__(self, name):
-            return getattr(self.capture, name)
-
-        def get(self, what):
-            return stated.get(what, self.capture.get(what))
-
-    monkeypatch.setattr(cv2, "VideoCapture", Capture)
-    refused(VideoError, message, lambda: read_video(tmp_path / "a.avi", Keep(**WHOLE)))
 
 
 def test_a_long_video_takes_the_memory_of_the_frames_that_are_kept(tmp_path):

@@ -2,10 +2,8 @@
 
 import pytest
 
-from sensors_io.__main__ import main
 from sensors_io.importers.label_table import LabelsError
 from sensors_io.importers.videos import VideosConfig, list_videos
-from sensors_io.records import RecordStore
 from sensors_io.schema import MATERIALS
 from tests.sensors_io.importers.films import film, imported, picture
 
@@ -52,19 +50,6 @@ def test_clips_become_records_with_the_labels_of_their_table(clips, tmp_path):
     assert [int(frame[-1, -1, 0]) for frame in frames] == [90, 100, 110]
 
 
-def test_without_a_table_every_clip_is_an_unlabelled_object(clips, tmp_path):
-    catalogue = list_videos(clips, VideosConfig(sensor="digit"))
-    assert set(catalogue.cards) == {"mug_1", "mug_2", "sponge", "towel_7", "cube", "other"}
-    assert {card.split for card in catalogue.cards.values()} == {"unlabelled"}
-
-
-def test_a_folder_of_pictures_alone_is_a_clip(tmp_path):
-    for n in range(3):
-        picture(tmp_path / "press" / f"{n}.png")
-    _, store = imported(list_videos(tmp_path / "press", VideosConfig(sensor="digit")), tmp_path / "records")
-    assert [key.object_id for key in store.contacts] == ["press"]
-
-
 @pytest.mark.parametrize(
     ("row", "said"),
     [
@@ -81,18 +66,3 @@ def test_a_folder_of_pictures_alone_is_a_clip(tmp_path):
 def test_what_does_not_fit_is_named_by_file_and_line(clips, row, said):
     with pytest.raises(LabelsError, match=rf"labels\.csv, {said}"):
         listed(clips, f"{TABLE}{row}\n")
-
-
-def test_a_column_that_is_unknown_is_named(clips):
-    with pytest.raises(LabelsError, match=r"columns are .*must be clip and any of"):
-        listed(clips, "clip,softness\nother,1\n")
-
-
-def test_the_command_names_the_one_that_trains(clips, tmp_path, capsys):
-    (tmp_path / "labels.csv").write_text(TABLE)
-    arguments = ["import", "videos", str(clips), "--labels", str(tmp_path / "labels.csv"), "--sensor", "gelsight_mini"]
-    assert main([*arguments, "--out", str(tmp_path / "records")]) == 0
-    assert len(RecordStore(tmp_path / "records")) == 5
-    out = capsys.readouterr().out
-    assert f"python -m experiments ablation_ordinal --data records --data-dir {tmp_path / 'records'}" in out
-    assert "is not listed in" in out

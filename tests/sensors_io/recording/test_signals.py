@@ -73,10 +73,3 @@ def test_a_sensor_that_felt_nothing_is_named():
     refused(OffsetsError, said, measure_offsets, heard(Feed("netft", 500)), late, "netft", "taps")
     refused(OffsetsError, "tac3d gave 0 samples", heard, of())
     refused(OffsetsError, "nothing tells a touch", heard, of(Sample(host_time_ns=0)))
-
-
-def test_repeated_stamps_are_left_out_and_fields_are_numbers_too():
-    fields = [np.full((2, 2, 2), 3.0 * i) * [1, 4 / 3] for i in range(20)]
-    samples = [Sample(host_time_ns=i, arrays={"deformation_mm": field}) for i, field in enumerate(fields)]
-    twice = of(*(s for s in samples for _ in range(2)), sensor="dmtac_x")
-    np.testing.assert_allclose(heard(twice).value, 5.0 * np.arange(20))

@@ -1,6 +1,7 @@
 """The chooser: what it promises, that it keeps it, and what it refuses."""
 
 import dataclasses
+import zlib
 
 import jax
 import jax.numpy as jnp
@@ -12,9 +13,10 @@ from sensors_io.layer import Layer
 from sensors_io.scenes import chooser, chooser_law, contact, nested
 from sensors_io.scenes.batching import CHUNK, chunks, gather, map_live
 from sensors_io.scenes.chooser_law import LAW, LOOK, MENU, SLACK, Setting
-from sensors_io.scenes.chooser_survey import FEATURES, PLAIN, survey
+from sensors_io.scenes.chooser_survey import FEATURES, survey
 from sensors_io.scenes.sensors import BODY, TAC3D
 from tests.sensors_io.checks import refused
+from tests.sensors_io.scenes.references import off
 
 WINDOW_MM, GEL = TAC3D.window_mm, TAC3D.gel
 STAGE = chooser.ContactScene(gel=GEL, body=BODY, window_mm=WINDOW_MM)
@@ -65,6 +67,12 @@ def test_the_menu_is_sorted_begins_with_the_look_and_can_be_solved() -> None:
     assert all(s.grid % 2 == 0 == s.padded % 2 and s.padded >= s.grid for s in MENU)
 
 
+def test_law_and_menu_are_those_that_were_fitted() -> None:
+    """By `pareto_chooser`; fitted anew, they have other checksums."""
+    law = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(LAW)])
+    assert (zlib.crc32(law.tobytes()), zlib.crc32(repr(MENU).encode())) == (3328676224, 3141607366)
+
+
 def test_errors_add_in_quadrature() -> None:
     """By hand: with all coefficients 0 each of the three parts is e⁰ = 1."""
     law = jax.tree.map(np.zeros_like, LAW)
@@ -87,20 +95,6 @@ def test_each_part_follows_its_formula() -> None:
     ):
         found = log_error(seen, dataclasses.replace(silent, **part), menu)
         np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-6)
-
-
-def test_many_surveys_have_the_errors_of_each() -> None:
-    each = [_survey(gap) for gap in (_ball, _bumps)]
-    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
-    found = log_error(both, LAW, MENU)
-    for row, seen in zip(found, each, strict=True):
-        np.testing.assert_allclose(row, log_error(seen, LAW, MENU), rtol=1e-5, atol=1e-5)
-
-
-def test_finer_grids_promise_less_error_where_the_contact_is_rough() -> None:
-    expected = {s: float(e) for s, e in zip(MENU, log_error(_survey(_bumps), LAW, MENU), strict=True)}
-    tight = [expected[s] for s in sorted(MENU, key=lambda s: s.grid) if s.tolerance == 3e-3 and s.padded == 2 * s.grid]
-    assert tight == sorted(tight, reverse=True)
 
 
 @pytest.mark.parametrize(
@@ -137,43 +131,6 @@ def test_a_survey_by_hand() -> None:
     assert float(seen.radius_mm) == pytest.approx(4 / np.sqrt(np.pi))
 
 
-def test_a_survey_ignores_offset_and_turn() -> None:
-    tilted = lambda n: _bumps(n) + 0.3 * (jnp.arange(n)[None] + 0.5) / n
-    for other in (lambda n: tilted(n) + 3.0, lambda n: tilted(n).T, lambda n: tilted(n)[::-1]):
-        np.testing.assert_allclose(_survey(other).features, _survey(tilted).features, atol=0.05)
-
-
-def test_a_survey_is_finite_where_little_or_all_touches() -> None:
-    needle = lambda n: jnp.full((n, n), 5.0, jnp.float32).at[: n // 24, : n // 24].set(0)
-    for gap in (needle, lambda n: jnp.zeros((n, n))):
-        for leaf in jax.tree.leaves(_survey(gap, 1e-3)):
-            assert np.all(np.isfinite(leaf))
-    assert len(PLAIN) < len(FEATURES) == len(LAW.grid)
-
-
-def test_less_error_costs_more_and_what_cannot_be_met_is_said() -> None:
-    costs = [_setting(_choose(error, _bumps)).cost for error in (0.4, 0.1, 0.03)]
-    assert costs == sorted(costs)
-    assert costs[0] < costs[-1]
-    choice = _choose(1e-4, _bumps)
-    assert not choice.met
-    assert choice.promised_error > SLACK * 1e-4
-
-
-def test_stiffness_and_force_scale_together() -> None:
-    body = dataclasses.replace(BODY, modulus_mpa=0.5)
-    double = [dataclasses.replace(b, modulus_mpa=2 * b.modulus_mpa) for b in (GEL, body)]
-    one = chooser.choose(0.05, _bumps, 2.0, GEL, body, WINDOW_MM)
-    two = chooser.choose(0.05, _bumps, 4.0, *double, WINDOW_MM)
-    assert _setting(one) == _setting(two)
-
-
-def test_an_array_is_averaged_to_the_grid() -> None:
-    fine = _bumps(4 * 48)
-    np.testing.assert_allclose(chooser.gap_on(fine, 48), _bumps(48), atol=0.02)
-    assert _choose(0.1, fine).promised_error == pytest.approx(_choose(0.1, _bumps).promised_error, rel=0.3)
-
-
 @pytest.mark.parametrize("gap", [_ball, _bumps])
 def test_the_promise_is_kept(gap) -> None:
     """Against 192² at a tight tolerance; the displacement is compared on the chosen grid."""
@@ -204,18 +161,15 @@ def test_many_scenes_are_solved_as_each_alone() -> None:
             np.testing.assert_allclose(bucket.contacts.displacement_mm[at], alone.displacement_mm, atol=1e-3 * scale)
 
 
-@pytest.mark.parametrize("grid", [24, 32, *(pytest.param(n, marks=pytest.mark.slow) for n in (48, 64))])
-def test_resuming_ends_where_solving_does(grid) -> None:
-    soft = _spectrum(36, 24)
+def test_resuming_ends_where_solving_does() -> None:
+    soft, fine = _spectrum(36, 24), _spectrum(64, 32)
     first = contact.solve(_bumps(24), 3.0, soft, 0 * soft, WINDOW_MM / 24, 3e-2)
     known = contact.Known(gap_mm=_bumps(24) + 1.0, pressure_mpa=first.pressure_mpa)
-    soft, gap, spacing = _spectrum(2 * grid, grid), _bumps(grid), WINDOW_MM / grid
-    resumed = contact.resume(known, gap, 3.0, soft, 0 * soft, spacing, 1e-3)
-    solved = contact.solve(gap, 3.0, soft, 0 * soft, spacing, 1e-3)
+    resumed = contact.resume(known, _bumps(32), 3.0, fine, 0 * fine, WINDOW_MM / 32, 1e-3)
+    solved = contact.solve(_bumps(32), 3.0, fine, 0 * fine, WINDOW_MM / 32, 1e-3)
     assert resumed.converged
-    off = np.linalg.norm(resumed.displacement_mm - solved.displacement_mm) / np.linalg.norm(solved.displacement_mm)
-    assert off < 2e-3
-    assert float(resumed.pressure_mpa.sum()) * spacing**2 == pytest.approx(3.0, rel=1e-4)
+    assert off(resumed.displacement_mm, solved.displacement_mm) < 2e-3
+    assert float(resumed.pressure_mpa.sum()) * (WINDOW_MM / 32) ** 2 == pytest.approx(3.0, rel=1e-4)
 
 
 def test_bad_input_is_refused() -> None:

@@ -7,18 +7,8 @@ import numpy as np
 import pytest
 
 from sensors_io.scenes import chooser_fit as fit
-from sensors_io.scenes import chooser_law
-from sensors_io.scenes.chooser_law import LAW, MENU, Survey
+from sensors_io.scenes.chooser_law import MENU, Survey
 from sensors_io.scenes.chooser_survey import FEATURES
-
-
-def test_the_host_picks_as_the_device_does():
-    rng = np.random.default_rng(0)
-    expected = rng.uniform(0.01, 1, (20, 6)).astype(np.float32)
-    index, met = fit.chosen(LAW, expected, 0.1)
-    for row, i, m in zip(expected, index, met, strict=True):
-        found = chooser_law.pick(0.1, jnp.log(row), LAW)
-        assert (int(found[0]), bool(found[2])) == (i, m)
 
 
 def test_the_least_margins_keep_enough():

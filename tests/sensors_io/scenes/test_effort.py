@@ -3,16 +3,14 @@
 import dataclasses
 
 import numpy as np
-import pytest
 
 from sensors_io import codec
 from sensors_io.scenes import effort, protocol
-from sensors_io.scenes.config import SceneConfig, config_hash
+from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.draws import draw
 from sensors_io.scenes.sensors import TAC3D
 from sensors_io.scenes.sequence import make_sequence
 from sensors_io.schema import Flag
-from tests.sensors_io.checks import refused
 
 CONFIG = SceneConfig(objects=2, sites=1, frames=3, max_force_n=4.0)
 ORDER = 2  # Tac3D, which has no picture to render
@@ -38,14 +36,6 @@ def test_less_error_takes_more_effort_and_what_cannot_be_met_is_said():
     assert (_choose(0.9).met, _choose(1e-4).met) == (True, False)
 
 
-def test_where_nothing_touches_the_least_effort_will_do():
-    made = _drawn()
-    path = dataclasses.replace(made.press.path, force_n=np.zeros(3, np.float32))
-    press = dataclasses.replace(made.press, path=path)
-    chosen = effort.choose(0.01, press, made.unit.modulus_factor, made.sensor)
-    assert (chosen.grid, chosen.met) == (effort.GRIDS[0], True)
-
-
 def test_records_say_on_which_grid_they_were_solved():
     asking = dataclasses.replace(CONFIG, error=1e-4)
     made = make_sequence(asking, 0, protocol.slot(asking, 0), ORDER, 0)
@@ -54,15 +44,3 @@ def test_records_say_on_which_grid_they_were_solved():
     assert np.all(made.flags & Flag.ERROR_UNMET)
     again = codec.decode_sequence(codec.encode_sequence(made))
     np.testing.assert_array_equal(again.contact_grid, made.contact_grid)
-
-
-def test_without_an_error_nothing_changes():
-    made = make_sequence(CONFIG, 0, protocol.slot(CONFIG, 0), ORDER, 0)
-    assert made.contact_grid is None
-    assert not np.any(made.flags & Flag.ERROR_UNMET)
-    assert config_hash(CONFIG) != config_hash(dataclasses.replace(CONFIG, error=0.05))
-
-
-@pytest.mark.parametrize("error", [0.0, 1.5])
-def test_an_error_out_of_range_is_refused(error):
-    refused(ValueError, r"error is .*must lie in \(0, 1\]", SceneConfig, error=error)

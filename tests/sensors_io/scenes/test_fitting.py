@@ -9,7 +9,6 @@ from sensors_io.scenes import fitting, photometric
 from sensors_io.scenes.fitting import BallPictures
 from sensors_io.scenes.photometric import MINI
 from sensors_io.scenes.sensors import GELSIGHT_MINI
-from tests.sensors_io.checks import refused
 
 RADIUS_MM, PX = 3.155, 64
 SCALE = GELSIGHT_MINI.window_mm / PX
@@ -38,18 +37,6 @@ def presses(profiles: fitting.Profiles) -> BallPictures:
     axis = (np.arange(PX) - (PX - 1) / 2) * SCALE
     made = [noisy(flat + fitting.change(MINI, profiles, t, axis, window)) for t in _touches()]
     return BallPictures(pictures=np.array(made), background=flat, radius_mm=RADIUS_MM, mm_per_px=SCALE)
-
-
-def test_inside_the_contact_the_gel_is_the_ball(profiles: fitting.Profiles) -> None:
-    """To the differences that the slope is taken by; across the edge it does not jump."""
-    for contact in (1.2, 2.0):
-        r, depth, slope = profiles.at(contact)
-        inside = r < 0.9 * contact
-        ball = -r[inside] / np.sqrt(RADIUS_MM**2 - r[inside] ** 2)
-        assert np.abs(slope[inside] - ball).max() < 0.03 * np.abs(ball).max()
-        assert depth[0] == depth.max()
-        edge = np.abs(r - contact) < 0.15 * contact
-        assert np.abs(np.diff(depth[edge])).max() < 0.06 * depth[0]
 
 
 def test_the_field_is_the_gradient_of_its_depth(profiles: fitting.Profiles) -> None:
@@ -84,7 +71,7 @@ def test_noise_and_grain_are_found_again(presses: BallPictures) -> None:
         assert noise.read[c] + noise.shot[c] * level == pytest.approx(READ + SHOT * level, rel=0.15)
         assert noise.grain[c] == pytest.approx(GRAIN, rel=0.3)
     assert noise.shared == pytest.approx(0.5, abs=0.15)
-
-
-def test_pictures_must_be_square_and_like_the_background(presses: BallPictures) -> None:
-    refused(ValueError, r"must be \[P, N, N, 3\]", dataclasses.replace, presses, pictures=presses.pictures[:, :, 2:])
+    pictures = presses.pictures.copy()
+    pictures[:, ::20, ::20] *= 0.7  # scratches, which are no grain
+    scratched = dataclasses.replace(presses, pictures=pictures)
+    assert fitting.measure_noise(scratched, _touches(), MINI).shared == pytest.approx(noise.shared, abs=0.25)

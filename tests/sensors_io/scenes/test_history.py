@@ -55,29 +55,6 @@ def test_no_path_gains_energy(corners: list[float], loss: float) -> None:
     assert elastic[0] == elastic[-1] == 0
 
 
-@settings(max_examples=60, deadline=None)
-@given(corners=paths, loss=losses)
-def test_loading_past_the_greatest_force_so_far_is_virgin(corners: list[float], loss: float) -> None:
-    force = _path(corners)
-    virgin = force >= np.maximum.accumulate(force)
-    np.testing.assert_array_equal(history.elastic_force(force, loss)[virgin], force[virgin])
-
-
-@settings(max_examples=60, deadline=None)
-@given(corners=paths, loss=losses, repeats=st.integers(2, 4))
-def test_the_rate_does_not_matter(corners: list[float], loss: float, repeats: int) -> None:
-    force = _path(corners, between=5)
-    slow = history.elastic_force(np.repeat(force, repeats), loss)
-    np.testing.assert_array_equal(slow[::repeats], history.elastic_force(force, loss))
-
-
-def test_an_inner_loop_closes() -> None:
-    force = _path([4.0, 2.0, 4.0, 2.0, 4.0], between=100)
-    elastic = history.elastic_force(force, 0.2)
-    np.testing.assert_allclose(elastic[100], elastic[300])
-    np.testing.assert_allclose(elastic[200:301], elastic[400:501])
-
-
 def test_losses_mix_by_stored_energy_and_a_hard_object_stores_nothing() -> None:
     loss = history.Loss(gel=0.05, body=0.45)
     assert [loss.of_contact(share) for share in (0.0, 1.0, 0.25)] == pytest.approx([0.05, 0.45, 0.15])

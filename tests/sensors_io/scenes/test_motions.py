@@ -2,12 +2,10 @@
 
 import itertools
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sensors_io.scenes import surface
-from sensors_io.scenes.motions import Pace, moved, plan
+from sensors_io.scenes.motions import Pace, plan
 from sensors_io.schema import EXPLORATORY, FORCES_N, MOTIONS, PRESS_FORCE_N, Phase
 from tests.sensors_io.checks import refused
 
@@ -64,16 +62,6 @@ def test_presses_do_not_move_sideways_and_those_of_a_tap_let_go(motion: str, pre
     assert np.sum(touching == 1) == presses
     assert np.sum(touching == -1) == (0 if motion == "press" else presses)
     assert np.sum(made.phase == Phase.HOLD) >= held
-
-
-POSE = surface.SensorPose(offset_mm=jnp.array([0.4, -0.2]), turn_rad=jnp.array(0.3), tilt=jnp.array([0.01, 0.0]))
-
-
-def test_a_tilt_is_a_slope() -> None:
-    pose = moved(POSE, jnp.array([1.0, 2.0]), jnp.array(0.1), jnp.array([0.1, -0.2]))
-    np.testing.assert_allclose(pose.offset_mm, [1.4, 1.8], rtol=1e-6)
-    np.testing.assert_allclose(pose.turn_rad, 0.4, rtol=1e-6)
-    np.testing.assert_allclose(pose.tilt, [0.01 + np.tan(0.1), np.tan(-0.2)], rtol=1e-6)
 
 
 def test_impossible_requests_are_refused() -> None:

@@ -1,6 +1,5 @@
 """The cheap tier: exact where it should be, within its promise elsewhere, and interpolation in a press ramp."""
 
-import dataclasses
 import functools
 
 import jax
@@ -8,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sensors_io.layer import Layer, normal_compliance, wave_numbers
-from sensors_io.scenes import contact, partial_slip, tangential, traction
+from sensors_io.layer import Layer
+from sensors_io.scenes import partial_slip, tangential, traction
 from sensors_io.scenes.hertz import Hertz
 from sensors_io.scenes.mindlin import half_space
 from tests.sensors_io.scenes.references import off
@@ -57,13 +56,6 @@ def test_a_half_space_is_exact(share: float) -> None:
     assert off(exact.traction_mpa, cheap) < 0.06
 
 
-@pytest.mark.parametrize(("stuck", "left"), [(0.0, 1.0), (1.0, 0.0), (1.1, 0.0)])
-def test_the_limits_are_exact_also_after_interpolation(stuck: float, left: float) -> None:
-    p = _pressure(FORCE)
-    found = partial_slip.ciavarella_jaeger(p, stuck * p, FRICTION, 1.0)
-    np.testing.assert_allclose(found, left * FRICTION * p, rtol=1e-6)
-
-
 @pytest.mark.parametrize(("levels", "error"), [(8, 0.16), (16, 0.06)])
 def test_interpolation_meets_the_ramp_carries_every_force_and_is_near_between(levels: int, error: float) -> None:
     pressures, forces = _ramp(levels)
@@ -90,51 +82,10 @@ def test_a_prescribed_slide_finds_its_force() -> None:
     assert stuck(forces, slides, jnp.float32(FORCE), FRICTION, jnp.float32(1.05 * full)) == 0
 
 
-def _dots() -> np.ndarray:
-    f = X / 3.3 - np.round(X / 3.3)
-    return RADIUS**2 / 50 - 0.12 * np.exp(-(f[None] ** 2 + f[:, None] ** 2) / 0.08)
-
-
 GEL = Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=4.0)
-HELD_OUT = {
-    "thin gel": (RADIUS**2 / 24, Layer(modulus_mpa=0.4, poisson=0.49, thickness_mm=2.0), None),
-    "usual gel": (RADIUS**2 / 18, GEL, None),
-    "dots": (_dots(), dataclasses.replace(GEL, thickness_mm=3.0), None),
-    "soft body": (RADIUS**2 / 30, GEL, 0.7),
-    "thick gel": (
-        X[None] ** 2 / 12 + X[:, None] ** 2 / 30,
-        Layer(modulus_mpa=0.3, poisson=0.4, thickness_mm=10.0),
-        5.0,
-    ),
-}
 
 
-@pytest.mark.parametrize("name", HELD_OUT)
-def test_the_promise_holds_on_held_out_contacts(name: str) -> None:
-    gap, gel, modulus = HELD_OUT[name]
-    body = None if modulus is None else Layer(modulus_mpa=modulus, poisson=0.4, thickness_mm=20.0)
-    q = np.hypot(*wave_numbers(M, SPACING))
-    spectra = [jnp.asarray(normal_compliance(q, gel), jnp.float32)]
-    spectra.append(jnp.zeros_like(spectra[0]) if body is None else jnp.asarray(normal_compliance(q, body), jnp.float32))
-    made = [traction.make_compliance(layer, M, SPACING) for layer in (gel, BODY)]
-    compliance = made[0] if modulus is None else traction.in_series(*made, 1.0, modulus)
-    full, stuck = (
-        contact.solve(jnp.asarray(gap, jnp.float32), jnp.float32(f), *spectra, SPACING, 1e-4).pressure_mpa
-        for f in (FORCE, 0.4 * FORCE)
-    )
-    pull = jnp.array([0.6 * FRICTION * FORCE, 0.0])
-    exact = tangential.solve_force(FRICTION * full, pull, STILL, compliance, SPACING, 1e-4).traction_mpa
-    cheap = partial_slip.ciavarella_jaeger(full, stuck, FRICTION, 1.0 + 0j)
-    observed = traction.make_response(gel, M, SPACING, 0.5).shear
-    exact_mm, cheap_mm = (traction.shear_displacement(t, observed) for t in (exact, cheap))
-    radius = float(np.sqrt(np.sum(full > 0) * SPACING**2 / np.pi))
-    promise = partial_slip.promised_error(gel, body, radius)
-    assert off(cheap_mm, exact_mm) < promise < 0.2
-
-
-def test_a_thinner_gel_is_promised_less() -> None:
-    thin, thick = (
-        partial_slip.promised_error(dataclasses.replace(GEL, thickness_mm=h), None, 4.0) for h in (2.0, 20.0)
-    )
-    assert max(3 * thick, 0.05) < thin
-    assert thick < 0.05
+@pytest.mark.parametrize(("body", "error"), [(None, 0.02331), (BODY, 0.01993)])
+def test_the_promised_error_by_hand(body: Layer | None, error: float) -> None:
+    """Of its formula, worked out once; `pareto_tangential` measures whether the promise is kept."""
+    assert partial_slip.promised_error(GEL, body, 2.0) == pytest.approx(error, rel=1e-3)

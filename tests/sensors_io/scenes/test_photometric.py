@@ -1,12 +1,13 @@
 """Photometric optics: the formula, its symmetries, and that the stored constants are those of a Mini."""
 
 import dataclasses
+import zlib
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sensors_io.scenes import optics, photometric
+from sensors_io.scenes import mini_optics, optics, photometric
 from sensors_io.scenes.photometric import MINI, PhotometricOptics
 from tests.sensors_io.checks import refused
 from tests.sensors_io.scenes.references import deformed, light
@@ -59,34 +60,14 @@ def test_gel_steeper_than_the_fit_is_shown_as_steep_as_the_fit(slope: float, til
     np.testing.assert_allclose(photometric.tilt(jnp.array(slope), jnp.array(0.0), 0.5), [tilt, 0], atol=1e-6)
 
 
+def test_the_constants_are_those_that_were_fitted_to_a_real_mini() -> None:
+    """Of the fit recorded by `scene_realism`; fitted anew, they have another checksum, and so have the records."""
+    constants = {name: value for name, value in vars(mini_optics).items() if name.isupper()}
+    assert zlib.crc32(repr(constants).encode()) == 1793279860
+
+
 def test_grain_has_its_deviation_and_its_correlations() -> None:
     grain = photometric.grain(np.random.default_rng(0), 200, (0.01, 0.02, 0.005), 0.6)
     np.testing.assert_allclose(grain.std((1, 2)), (0.01, 0.02, 0.005), rtol=0.05)
     assert np.corrcoef(grain[0].ravel(), grain[1].ravel())[0, 1] == pytest.approx(0.6, abs=0.05)
     assert np.corrcoef(grain[0, 1:].ravel(), grain[0, :-1].ravel())[0, 1] == pytest.approx(0.5, abs=0.05)
-
-
-def test_grain_multiplies_the_flat_field_at_any_size_of_picture() -> None:
-    flat = np.asarray(photometric.gelsight_mini(_gel(ZERO), _light()))
-    for size in (PX, 2):
-        lit = photometric.gelsight_mini(_gel(ZERO), _light(np.full((3, size, size), 0.1, np.float32)))
-        np.testing.assert_allclose(lit, 1.1 * flat, rtol=1e-5)
-
-
-def test_flat_gel_has_the_background_of_the_real_one() -> None:
-    """Read off the recording by eye: pink in the middle, blue-green above, dull green below."""
-    image = 255 * np.asarray(photometric.gelsight_mini(_gel(ZERO), _light()))
-    middle, top, bottom = image[PX // 2, PX // 2], image[3, PX // 2], image[-4, PX // 2]
-    assert middle[0] > 1.4 * max(top[0], bottom[0])
-    assert top[2] > 1.2 * bottom[2]
-    assert top[1] > top[0]
-    assert np.all((image > 20) & (image < 180))
-
-
-def test_a_dent_is_red_above_and_blue_below() -> None:
-    bump = 0.8 * np.exp(-(X[None] ** 2 + X[:, None] ** 2) / 4)
-    change = np.asarray(photometric.gelsight_mini(_gel(bump), _light()))
-    change = change - np.asarray(photometric.gelsight_mini(_gel(ZERO), _light()))
-    above, below = change[PX // 2 - 5, PX // 2], change[PX // 2 + 5, PX // 2]
-    assert above[0] > 0.05 > -0.05 > below[0]
-    assert below[2] > 0.05 > -0.05 > above[2]

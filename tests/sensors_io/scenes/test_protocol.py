@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 
-import jax
 import numpy as np
 import pytest
 
@@ -11,13 +10,12 @@ from sensors_io.scenes import press as press_module
 from sensors_io.scenes import readout
 from sensors_io.scenes.cards import object_cards
 from sensors_io.scenes.config import SceneConfig, config_hash
-from sensors_io.scenes.draws import site_of
 from sensors_io.scenes.protocol import contacts, make_contact
 from sensors_io.scenes.sensors import MODELS
-from sensors_io.schema import SENSORS, UNKNOWN, Flag, Sequence
+from sensors_io.schema import SENSORS, Flag, Sequence
 from tests.sensors_io.checks import refused
 
-SMALL = SceneConfig(objects=130, sites=2, frames=3, image_px=48, contact_grid=40, view_px=32, min_force_n=1.0)
+SMALL = SceneConfig(objects=60, sites=2, frames=3, image_px=48, contact_grid=40, view_px=32, min_force_n=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +48,7 @@ def test_generation_resumes_anywhere_with_the_same_values(some: list[list[Sequen
 def test_generation_ends_and_refuses_a_start_outside() -> None:
     assert len(list(contacts(SMALL, start=SMALL.contact_count - 2))) == 2
     assert list(contacts(SMALL, start=SMALL.contact_count)) == []
-    refused(ValueError, r"start is 261: must lie in \[0, 260\]", contacts, SMALL, start=261)
+    refused(ValueError, r"start is 121: must lie in \[0, 120\]", contacts, SMALL, start=121)
 
 
 def test_each_contact_holds_the_four_sensors_in_order(some: list[list[Sequence]]) -> None:
@@ -108,18 +106,6 @@ def test_flags_say_what_happened(some: list[list[Sequence]]) -> None:
     assert not np.any(strain[deepest < 0.6 * limit])
 
 
-def test_the_cap_raises_the_flag() -> None:
-    capped = dataclasses.replace(SMALL, solver_max_iterations=1)
-    flags = np.concatenate([s.flags for s in make_contact(capped, 4)])
-    assert np.any(flags & Flag.NOT_CONVERGED)
-
-
-def test_one_compilation_per_sensor(some: list[list[Sequence]]) -> None:
-    before = press_module.record._cache_size()
-    make_contact(SMALL, 7)
-    assert press_module.record._cache_size() == before
-
-
 def test_labels_of_the_cards_match_the_truth() -> None:
     cards = object_cards(SMALL)
     assert [c.object_id for c in cards] == [f"g{i:06d}" for i in range(SMALL.objects)]
@@ -134,15 +120,8 @@ def test_labels_of_the_cards_match_the_truth() -> None:
 
 def test_splits_are_exact_and_follow_the_seed() -> None:
     first, again, other = ([c.split for c in object_cards(dataclasses.replace(SMALL, seed=s))] for s in (0, 0, 1))
-    assert [first.count(s) for s in ("train", "val", "test")] == [91, 13, 26]
+    assert [first.count(s) for s in ("train", "val", "test")] == [42, 6, 12]
     assert first == again != other
-
-
-def test_objects_do_not_depend_on_how_many_there_are() -> None:
-    few, many = (object_cards(dataclasses.replace(SMALL, objects=n)) for n in (5, 9))
-    for a, b in zip(few, many[:5], strict=True):
-        assert a.truth == b.truth
-        np.testing.assert_array_equal(a.view, b.view)
 
 
 def test_the_hash_tells_configs_apart_and_later_fields_leave_it_as_it_was() -> None:
@@ -155,18 +134,22 @@ def test_the_hash_tells_configs_apart_and_later_fields_leave_it_as_it_was() -> N
 
 
 def test_bad_configs_are_refused_by_name() -> None:
-    refused(ValueError, "objects is .*must", dataclasses.replace, SMALL, objects=0)
-    refused(ValueError, "sites is .*must", dataclasses.replace, SMALL, sites=0)
-    refused(ValueError, "frames is .*must", dataclasses.replace, SMALL, frames=0)
-    refused(ValueError, "contact_grid is .*must", dataclasses.replace, SMALL, contact_grid=20)
-    refused(ValueError, "contact_grid is .*must", dataclasses.replace, SMALL, contact_grid=41)
-    refused(ValueError, "image_px is .*must", dataclasses.replace, SMALL, image_px=8)
-    refused(ValueError, "visual_lie_share is .*must", dataclasses.replace, SMALL, visual_lie_share=1.2)
-    refused(ValueError, "min_force_n is .*must", dataclasses.replace, SMALL, min_force_n=0.0)
-    refused(ValueError, "min_force_n is .*must", dataclasses.replace, SMALL, min_force_n=30.0)
-    refused(ValueError, "split_shares is .*must", dataclasses.replace, SMALL, split_shares=(0.5, 0.2, 0.2))
-    refused(ValueError, "solver_tolerance is .*must", dataclasses.replace, SMALL, solver_tolerance=0.0)
-    refused(ValueError, "force_jitter is .*must", dataclasses.replace, SMALL, force_jitter=0.5)
+    """The last value that is taken, and the first ones that are not."""
+    edges: dict[str, tuple] = {
+        "objects": (1, 0), "sites": (1, 0), "frames": (1, 0), "contact_grid": (24, 22, 25), "image_px": (16, 15),
+        "view_px": (16, 15), "error": (1.0, 0.0, 1.01), "visual_lie_share": (1.0, -0.01, 1.01),
+        "min_force_n": (20.0, 0.0, 20.1), "force_jitter": (0.1, -0.01, 0.11), "force_gain_error": (1.0, -0.01, 1.01),
+        "force_noise_n": (0.0, -0.01), "ramp_s": (0.01, 0.0), "adhesion_j_per_m2": (0.0, -1.0),
+        "adhesion_tolerance": (0.01, 0.0), "part_share": (1.0, -0.01), "graded_share": (1.0, -0.01, 1.01),
+        "split_shares": ((0.0, 0.5, 0.5), (0.5, 0.2, 0.2), (-0.2, 0.6, 0.6)), "solver_tolerance": (0.99, 0.0, 1.0),
+        "solver_max_iterations": (1, 0), "seed": (0, -1),
+    }  # fmt: skip
+    for name, (edge, *wrong) in edges.items():
+        assert getattr(dataclasses.replace(SMALL, **{name: edge}), name) == edge
+        for value in wrong:
+            refused(ValueError, f"{name} is .*must", dataclasses.replace, SMALL, **{name: value})
+    refused(ValueError, "graded_share is .*must", SceneConfig, part_share=0.5, graded_share=0.6)
+    assert SMALL.contact_count == 120
 
 
 def test_padding_is_two_thicknesses_and_smooth() -> None:
@@ -176,41 +159,3 @@ def test_padding_is_two_thicknesses_and_smooth() -> None:
         assert (size - 64) * model.window_mm / 64 >= 2 * model.gel.thickness_mm
         assert size <= 110
         assert 30**7 % size == 0
-
-
-def test_float32_recordings_are_finite(some: list[list[Sequence]]) -> None:
-    for leaf in jax.tree.leaves([[s.depth_mm, s.deformation_mm, s.shear_mm, s.force_n] for c in some for s in c]):
-        assert np.all(np.isfinite(leaf))
-
-
-def test_touch_tells_hardness_and_force_alone_does_not(some: list[list[Sequence]]) -> None:
-    labels = np.array([c.labels["hardness"] for c in object_cards(SMALL)])
-    force = np.array([c[2].force_n[:, 2] for c in some])
-    depth = np.array([np.maximum(c[2].depth_mm, 1e-3) for c in some])
-    touch = np.concatenate([np.log(depth.max((2, 3))), np.log(depth.mean((2, 3)))], 1)
-    assert _leave_one_out(touch, labels) > 0.58
-    assert _leave_one_out(force, labels) < 0.46
-
-
-def _leave_one_out(features: np.ndarray, labels: np.ndarray) -> float:
-    """Accuracy of linear discriminants with pooled covariance, each object judged by all others."""
-    hits = 0
-    for i in range(len(labels)):
-        rest = np.arange(len(labels)) != i
-        x, y = features[rest], labels[rest]
-        means = np.array([x[y == k].mean(0) for k in range(3)])
-        within = np.cov((x - means[y]).T) + 1e-4 * np.eye(x.shape[1])
-        apart = features[i] - means
-        hits += int(np.argmin(np.einsum("kd,de,ke->k", apart, np.linalg.inv(within), apart)) == labels[i])
-    return hits / len(labels)
-
-
-def test_objects_may_vary_and_their_sites_do_not() -> None:
-    varied = dataclasses.replace(SMALL, objects=40, part_share=0.5, graded_share=0.5)
-    cards = object_cards(varied)
-    assert all("far_modulus_mpa" in (card.truth or {}) for card in cards)
-    assert any(UNKNOWN in card.labels.values() for card in cards)
-    site = site_of(varied, 0, 0, 0)
-    assert site.solid.variation is None
-    with pytest.raises(ValueError, match=r"graded_share is 0\.6: must be ≤ 1 − part_share = 0\.5"):
-        dataclasses.replace(varied, graded_share=0.6)

@@ -69,13 +69,6 @@ def test_every_cell_gets_the_same_forces(made):
         assert max(counts.values()) - min(counts.values()) <= len(EXPLORATORY)
 
 
-def test_the_ceiling_is_the_worst_cells_quantile_and_never_above_the_own_limit(limits):
-    ceiling = schedule.ceilings(limits.rigid_n, _cell(), np.random.default_rng(1))
-    assert np.all(ceiling <= limits.rigid_n + 1e-12)
-    worst = min(np.sort(limits.rigid_n[_cell() == c])[-1] for c in range(9))
-    assert ceiling.max() <= worst
-
-
 def test_left_out_frames_are_counted(made, limits):
     counts = made.left_out
     touched = sum((motions.plan(s.motion, 1.0, schedule.pace(40)).force_n > 0).sum() for s in made.slots)
@@ -93,13 +86,6 @@ def test_the_pace_fits_any_length(pace):
         hand = motions.plan(motion, 5.0, pace)
         assert len(hand) == pace.frames
         assert hand.force_n.max() == pytest.approx(5)
-
-
-def test_presses_alone_go_object_by_object():
-    config = SceneConfig(objects=4, sites=3)
-    slots = [schedule.press_slot(config, i) for i in range(12)]
-    assert [s.object_index for s in slots] == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3]
-    assert [s.site for s in slots] == [0, 1, 2] * 4
 
 
 def test_weak_objects_and_bad_sizes_are_refused_by_name():

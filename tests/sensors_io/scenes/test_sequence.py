@@ -5,12 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sensors_io.scenes import history, motions, protocol, schedule, strength
+from sensors_io.scenes import motions, protocol, schedule, strength
 from sensors_io.scenes.config import SceneConfig
-from sensors_io.scenes.draws import draw, site_of
+from sensors_io.scenes.draws import site_of
 from sensors_io.scenes.protocol import make_contact
 from sensors_io.scenes.sensors import MODELS
-from sensors_io.scenes.sequence import light_touches, make_sequence
+from sensors_io.scenes.sequence import make_sequence
 from sensors_io.schema import SENSORS, Flag, Phase
 
 CONFIG = SceneConfig(objects=12, sequences=4 * 40, frames=40, image_px=24, contact_grid=24, view_px=16)
@@ -43,26 +43,6 @@ def test_friction_follows_the_slide_and_keeps_to_coulomb(slide):
     assert np.abs(slide.shear_mm[moving]).max() > 5 * np.abs(slide.shear_mm[: 1 + hand.phase.argmax()][0]).max() / 4
 
 
-def test_nothing_touches_before_the_approach_ends(slide):
-    free = slide.target_force_n == 0
-    assert free[0]
-    assert np.abs(slide.force_n[free]).max() < 0.2
-    assert np.abs(slide.depth_mm[free]).max() < 0.2
-    assert not np.any(slide.flags[free])
-
-
-def test_a_held_object_gives_back_less_than_it_took(hold):
-    deepest = np.sort(hold.depth_mm.reshape(len(hold), -1), -1)[:, -40:].mean(-1)  # a tenth of the field
-    assert history.returned_share(np.maximum(-hold.force_n[:, 2].astype(float), 0), deepest) < 0.97
-
-
-def test_moment_is_the_lever_of_the_load(slide):
-    assert slide.moment_nmm is not None
-    still = slide.target_force_n == 0
-    np.testing.assert_array_equal(slide.moment_nmm[still], 0)
-    assert np.abs(slide.moment_nmm[:, 2]).max() < 10 * np.abs(slide.force_n[:, :2]).max() + 1
-
-
 def test_frames_come_on_the_cameras_clock(slide, hold):
     for sequence in (slide, hold):
         assert np.all(np.diff(sequence.host_time_ns) > 0)
@@ -92,21 +72,6 @@ def test_a_sequence_repeats_bit_for_bit_and_what_adhesion_would_change_is_flagge
     np.testing.assert_array_equal(adhesive(much), slide.target_force_n > 0)
 
 
-def test_adhesion_counts_in_the_lightest_touches_of_smooth_objects():
-    config = dataclasses.replace(CONFIG, objects=40)
-    force = np.array([0.0, 0.01, 0.1, 0.3, 1.0, 5.0])
-    found = []
-    for index in range(config.objects):
-        site = site_of(config, index, 0, 0)
-        found.append(light_touches(config, MODELS[TAC3D], site, force) > 0)
-        if site.solid.rms_mm > 0.03:
-            assert not found[-1].any()
-    share = np.mean(found, 0)
-    assert share[0] == share[-1] == 0
-    assert np.all(np.diff(share[1:]) <= 0)
-    assert 0.1 < share[1] < 0.7
-
-
 def test_a_contact_past_the_limit_is_replaced_by_another_site(monkeypatch, hold):
     tried = []
 
@@ -125,29 +90,6 @@ def test_a_contact_past_the_limit_is_replaced_by_another_site(monkeypatch, hold)
         made = make_contact(config, 0)
         assert tried == [0] * 4
         assert all(s.flags.any() for s in made)
-
-
-def test_a_draw_is_what_the_sequence_was_made_of(slide):
-    drawn = draw(CONFIG, 5, _slot("slide_x"), TAC3D)
-    assert slide.serial == f"generated-tac3d-{drawn.serial}"
-    np.testing.assert_array_equal(slide.target_force_n, drawn.hand.force_n.astype(np.float32))
-    normal = np.column_stack([np.zeros((40, 2)), -drawn.force_n])
-    np.testing.assert_allclose(slide.force_n[:, 2], drawn.force_sensor.read(normal)[:, 2])
-    assert np.all(drawn.press.path.force_n >= drawn.force_n.astype(np.float32))
-
-
-def test_a_coupled_press_feels_the_spreading_gel_and_an_uncoupled_one_nothing(hold):
-    coupled = make_sequence(dataclasses.replace(CONFIG, coupled=True), 6, _slot("hold", 8.0), TAC3D, 0)
-    np.testing.assert_array_equal(coupled.depth_mm.shape, hold.depth_mm.shape)
-    pressed = hold.target_force_n > 4
-    change = np.abs(coupled.shear_mm - hold.shear_mm)[pressed].max()
-    assert 0.002 < change < 0.5  # above the rounding, below what would be a slide
-    assert np.abs(coupled.force_n[:, :2] - hold.force_n[:, :2]).max() < 0.3  # what spreads evenly pulls nowhere
-
-
-def test_another_attempt_is_another_site():
-    first, second = (site_of(CONFIG, 3, 1, trial) for trial in (0, 1))
-    assert np.abs(first.place_mm - second.place_mm).max() > 0.1
 
 
 def test_limits_lie_where_the_strain_does():

@@ -12,7 +12,7 @@ from sensors_io.layer import Layer
 from sensors_io.scenes import tangential, traction
 from sensors_io.scenes.hertz import Hertz
 from sensors_io.scenes.mindlin import FrictionalSphere, half_space
-from tests.sensors_io.scenes.references import off, shear_tensor
+from tests.sensors_io.scenes.references import off
 
 N, WINDOW_MM = 48, 16.0
 SPACING = WINDOW_MM / N
@@ -79,13 +79,6 @@ def test_cattaneo_and_mindlin(share: float) -> None:
     assert _force(solved) == pytest.approx(share * most, rel=1e-5)
 
 
-def test_prescribed_slide_and_prescribed_force_agree() -> None:
-    pulled = _pull(_limit(), (0.3, 0.4), _half_space())
-    slid = _slide(_limit(), complex(pulled.slide_mm), _half_space(), tolerance=1e-4)
-    assert _force(slid) == pytest.approx(0.3 + 0.4j, rel=2e-3)
-    assert off(slid.traction_mpa, pulled.traction_mpa) < 0.02
-
-
 @pytest.mark.parametrize("stick_ratio", [0.8, 0.5, 0.2, 0.0])
 def test_lubkin_twist(stick_ratio: float) -> None:
     """Down to the whole contact slipping, at a torque of 3π/16 μFa."""
@@ -96,22 +89,6 @@ def test_lubkin_twist(stick_ratio: float) -> None:
     assert moment[2] == pytest.approx(torque, rel=0.02)
     np.testing.assert_allclose(force, 0, atol=1e-4)
     assert solved.stick_share == pytest.approx(stick_ratio**2, abs=0.08)
-
-
-def test_a_long_slide_slips_everywhere() -> None:
-    limit = _rough_pressure()
-    solved = _slide(limit, 30 * np.exp(0.7j), _layer())
-    assert solved.stick_share == 0
-    assert off(solved.traction_mpa, limit * np.exp(0.7j)) < 5e-3
-
-
-def test_without_a_limit_it_sticks_and_is_linear() -> None:
-    limit = 1e3 * (_rough_pressure() > 0)
-    once, twice = (_slide(limit, s, _layer(), tolerance=1e-5) for s in (0.1 + 0.05j, 0.2 + 0.1j))
-    contact = limit > 0
-    assert once.stick_share == 1
-    np.testing.assert_allclose(once.displacement_mm[contact], 0.1 + 0.05j, atol=1e-4)
-    assert _force(twice) == pytest.approx(2 * _force(once), rel=1e-3)
 
 
 def test_the_force_limit_is_a_flag() -> None:
@@ -130,36 +107,7 @@ def test_no_contact_or_no_motion_no_traction() -> None:
         np.testing.assert_array_equal(solved.traction_mpa, 0)
 
 
-def _reference(limit: np.ndarray, target: np.ndarray, layer: Layer, points: int = 2 * N) -> np.ndarray:
-    """Float64, by real components and accelerated projected gradients with restarts, to a gap of 1e-7."""
-    tensor = shear_tensor(layer, points, SPACING)
-
-    def moved(t: np.ndarray) -> np.ndarray:
-        spectrum = np.fft.rfft2(t, s=(points, points))
-        return np.fft.irfft2(np.einsum("abyx,byx->ayx", tensor, spectrum), s=(points, points))[:, :N, :N]
-
-    goal = np.stack([target.real, target.imag])
-    step, t, y, momentum = 1 / tensor.max(), np.zeros((2, N, N)), np.zeros((2, N, N)), 1.0
-    for _ in range(6000):
-        trial = y + step * (goal - moved(y))
-        new = trial * np.minimum(1, limit / np.maximum(np.hypot(*trial), 1e-300))
-        if np.sum((y - new) * (new - t)) > 0:
-            y, momentum = t, 1.0
-            continue
-        following = (1 + np.sqrt(1 + 4 * momentum**2)) / 2
-        y, t, momentum = new + (momentum - 1) / following * (new - t), new, following
-        slip = goal - moved(t)
-        gap = np.sum(limit * np.hypot(*slip) - np.sum(slip * t, 0))
-        if gap < 1e-7 * np.sum(limit * np.hypot(*goal)):
-            return t[0] + 1j * t[1]
-    raise RuntimeError(f"reference traction: gap {gap:.1e}; raise the cap")
-
-
-def _carried(field: np.ndarray) -> np.ndarray:
-    return jax.device_get(SHEAR_DISPLACEMENT(jnp.asarray(field, jnp.complex64), _layer()))
-
-
-REFERENCE_SCENES = {
+GRIPS = {
     "sphere": (_limit(), np.full((N, N), 0.2 + 0j)),
     "dots": (_rough_pressure(1), np.full((N, N), 0.1 + 0.15j)),
     "twist": (_rough_pressure(2), 0.1j * (X[None] + 1j * X[:, None])),
@@ -167,26 +115,18 @@ REFERENCE_SCENES = {
 }
 
 
-@pytest.mark.parametrize("name", REFERENCE_SCENES)
-def test_agrees_with_the_float64_reference(name: str) -> None:
-    limit, target = REFERENCE_SCENES[name]
-    reference = _reference(limit, target, GEL)
-    for tolerance, u_error, t_error in ((2e-3, 0.03, 0.1), (5e-5, 1e-3, 0.015)):
-        solved = _slide(limit, target, _layer(), tolerance=tolerance, max_iterations=400)
-        assert solved.converged
-        assert off(solved.displacement_mm, _carried(reference)) < u_error
-        assert off(solved.traction_mpa, reference) < t_error
-        assert np.all(np.abs(solved.traction_mpa) <= limit * (1 + 1e-5))
-
-
-@pytest.mark.parametrize("name", REFERENCE_SCENES)
-def test_the_residual_is_the_gap_of_the_friction_law(name: str) -> None:
-    limit, target = REFERENCE_SCENES[name]
-    solved = _slide(limit, target, _layer())
-    slip = target - _carried(solved.traction_mpa)
+@pytest.mark.parametrize("tolerance", [tangential.TOLERANCE, 5e-5])
+@pytest.mark.parametrize("name", GRIPS)
+def test_the_gap_of_the_friction_law_closes(name: str, tolerance: float) -> None:
+    """The problem is convex: an admissible traction without a gap is the solution."""
+    limit, target = GRIPS[name]
+    solved = _slide(limit, target, _layer(), tolerance=tolerance, max_iterations=400)
+    slip = target - jax.device_get(SHEAR_DISPLACEMENT(jnp.asarray(solved.traction_mpa, jnp.complex64), _layer()))
     gap = np.sum(limit * np.abs(slip) - (slip.conj() * solved.traction_mpa).real) / np.sum(limit * np.abs(target))
     assert gap == pytest.approx(float(solved.residual), abs=1e-5)
-    assert bool(solved.converged) == (solved.residual < tangential.TOLERANCE)
+    assert solved.converged
+    assert solved.residual < tolerance
+    assert np.all(np.abs(solved.traction_mpa) <= limit * (1 + 1e-5))
 
 
 HARD_CASES = {
@@ -208,21 +148,3 @@ def test_hard_cases_converge_without_nan(name: str) -> None:
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(solved))
     assert solved.converged
     assert np.all(np.abs(solved.traction_mpa) <= limit * (1 + 1e-5))
-
-
-def test_the_cap_clears_converged() -> None:
-    solved = _slide(_rough_pressure(), 0.15, _layer(), tolerance=1e-5, max_iterations=2)
-    assert not solved.converged
-    assert solved.iterations == 2
-    assert solved.residual >= 1e-5
-
-
-def test_mapped_equals_single_and_a_start_changes_nothing() -> None:
-    limit = jnp.asarray(_rough_pressure(), jnp.float32)
-    fields = jnp.asarray(np.stack([np.full((N, N), s) for s in (0.1, 0.2j)]), jnp.complex64)
-    solve = functools.partial(tangential.solve, limit, compliance=_layer(), tolerance=1e-4)
-    mapped = jax.jit(lambda f: jax.lax.map(lambda one: solve(one), f))(fields)
-    single = _slide(_rough_pressure(), 0.2j, _layer(), tolerance=1e-4)
-    warm = _slide(_rough_pressure(), 0.2j, _layer(), tolerance=1e-4, start_mpa=mapped.traction_mpa[0])
-    for found in (mapped.displacement_mm[1], warm.displacement_mm):
-        np.testing.assert_allclose(found, single.displacement_mm, atol=2e-3)

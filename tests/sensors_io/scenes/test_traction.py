@@ -68,30 +68,6 @@ def test_longitudinal_compliance_in_closed_form(poisson: float) -> None:
     assert longitudinal_compliance(np.array([200.0]), layer)[0] == pytest.approx(half_space)
 
 
-def test_compliance_is_symmetric_and_positive() -> None:
-    compliance = traction.make_compliance(GEL, M, SPACING)
-    a, b = jnp.asarray(TRACTION, jnp.complex64), jnp.asarray(TRACTION.T[::-1], jnp.complex64)
-    ab = np.vdot(a, SHEAR_DISPLACEMENT(b, compliance)).real
-    ba = np.vdot(b, SHEAR_DISPLACEMENT(a, compliance)).real
-    assert ab == pytest.approx(ba, rel=1e-4)
-    assert np.vdot(a, SHEAR_DISPLACEMENT(a, compliance)).real > 0
-
-
-def test_shear_moves_the_depth_as_pressure_moves_the_sides() -> None:
-    """Maxwell and Betti: the work of one load on the displacement by another does not depend on which is which."""
-    response = traction.make_response(GEL, M, SPACING, 0.0)
-    pressure, shear = jnp.asarray(PRESSURE, jnp.float32), jnp.asarray(TRACTION, jnp.complex64)
-    along, _ = DISPLACEMENT(pressure, jnp.zeros_like(shear), response)
-    _, depth = DISPLACEMENT(jnp.zeros_like(pressure), shear, response)
-    assert np.vdot(TRACTION, along).real == pytest.approx(np.vdot(PRESSURE, depth), rel=1e-4)
-
-
-def test_a_uniform_load_shears_the_layer_uniformly() -> None:
-    compliance = traction.make_compliance(GEL, N, SPACING)  # no padding: the load is periodic
-    moved = SHEAR_DISPLACEMENT(jnp.full((N, N), 0.01 + 0.02j, jnp.complex64), compliance)
-    np.testing.assert_allclose(moved, (0.01 + 0.02j) * 4.0 / GEL.shear_modulus_mpa, rtol=1e-4)
-
-
 def test_bodies_in_series_add() -> None:
     gel, body = traction.make_compliance(GEL, M, SPACING), traction.make_compliance(BODY, M, SPACING)
     q = np.hypot(*wave_numbers(M, SPACING))[0]

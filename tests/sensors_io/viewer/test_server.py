@@ -5,7 +5,6 @@ import http.client
 import json
 import socket
 import struct
-import threading
 import urllib.error
 import urllib.parse
 import urllib.request
@@ -55,38 +54,6 @@ def test_page_numbers_and_pictures():
         assert picture(view, "tac3d: depth").mean((0, 1))[0] > 180
         for path in ("panel/shear", "etc/passwd"):
             refused(urllib.error.HTTPError, "404", ask, view, path)
-
-
-def test_one_connection_serves_many_pictures_and_each_is_drawn_once():
-    drawn = []
-
-    def panel():
-        drawn.append(threading.get_ident())
-        return np.zeros((4, 4, 3), np.uint8)
-
-    with LiveView(port=0) as view:
-        host, port = view.address.removeprefix("http://").rstrip("/").split(":")
-        connection = http.client.HTTPConnection(host, int(port), timeout=10)
-        view.publish({"camera": panel}, NUMBERS)
-        assert drawn == []  # nobody has looked yet
-        for _ in range(5):
-            connection.request("GET", "/panel/camera")
-            assert connection.getresponse().read()[:2] == b"\xff\xd8"
-        connection.close()
-    assert len(drawn) == 1
-    assert drawn[0] != threading.get_ident()
-
-
-def test_streams_end_with_the_view_and_a_taken_port_is_an_error():
-    with LiveView(port=0) as view:
-        port = int(urllib.parse.urlsplit(view.address).port)
-        with pytest.raises(OSError, match="in use"), LiveView(port=port):
-            pass
-        view.publish({}, NUMBERS)
-        events = ask(view, "numbers")
-        events.readline()
-    assert events.read() == b"\n"
-    events.close()
 
 
 def test_panels_of_a_sample():
@@ -177,18 +144,6 @@ def test_requests_of_no_browser_are_refused_without_a_word_in_the_terminal(capfd
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         assert requested(view)[0] == 200
     assert capfd.readouterr().err == ""
-
-
-def test_connections_too_many_are_closed():
-    with LiveView(port=0) as view:
-        port = int(urllib.parse.urlsplit(view.address).port)
-        before = threading.active_count()
-        silent = [socket.create_connection(("127.0.0.1", port), timeout=10) for _ in range(100)]
-        for connection in silent[64:]:
-            assert connection.recv(1) == b""
-        assert threading.active_count() - before <= 64
-        for connection in silent:
-            connection.close()
 
 
 def test_numbers_that_json_does_not_know_are_null():
