@@ -33,7 +33,7 @@ class ShardWriter:
     def __init__(self, root: pathlib.Path, kind: str, number: int):
         self._number, self._path = number, root / shard_file(kind, number)
         self._temporary = root / f".{self._path.name}.{os.getpid()}.tmp"  # two workers may try the same
-        self._writer = ArrayRecordWriter(str(self._temporary), _OPTIONS)
+        self._writer = ArrayRecordWriter(_name(self._temporary), _OPTIONS)
         self._count = 0
 
     def write(self, data: bytes) -> None:
@@ -44,7 +44,7 @@ class ShardWriter:
     def publish(self) -> np.ndarray:
         """Close, count, sync and rename the file; its row.  The writer reports no failure: counting finds it."""
         self._writer.close()
-        reader = ArrayRecordReader(str(self._temporary))
+        reader = ArrayRecordReader(_name(self._temporary))
         found = reader.num_records() if reader.ok() else 0
         reader.close()
         if found < self._count:
@@ -95,7 +95,8 @@ class Entries:
                 return self._open[shard]
         row = self._shards[shard]
         path = local(self._root, shard_file(self._kind, row["number"]), size=int(row["bytes"]))
-        source = ArrayRecordDataSource([f"{path}[0:{row['entries']}]"])  # the range spares opening it to count it
+        spared = f"{_name(path)}[0:{row['entries']}]"  # the range spares opening it to count it
+        source = ArrayRecordDataSource([spared])
         with self._lock:
             source = self._open.setdefault(shard, source)
             if len(self._open) > _OPEN:
@@ -113,3 +114,15 @@ def _check_size(path: pathlib.Path, bytes_: int) -> None:
         raise CorruptRecordsError(
             f"{path} {found}: copy it again from its source, or delete {path.parent} and write it again"
         )
+
+
+def _name(path: pathlib.Path) -> str:
+    """The path as ArrayRecord takes it.
+
+    Raises:
+      RecordsError: a name of one of its folders is no UTF-8, or of several lines.
+    """
+    name = str(path)
+    if "\n" in name or os.fsencode(name).decode(errors="replace") != name:
+        raise RecordsError(f"{name!r} is no path that records can have: must be one line of UTF-8; rename its folder")
+    return name
