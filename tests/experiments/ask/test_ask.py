@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import json
 import re
-import socket
 import sys
 import types
 import urllib.error
@@ -15,7 +14,6 @@ import cv2
 import numpy as np
 import pytest
 
-from experiments.ask.answers import ask_policy
 from experiments.ask.command import run_asking
 from experiments.ask.demo import demo_server
 from experiments.ask.inputs import read_touch
@@ -24,7 +22,6 @@ from experiments.core.runs import ROOT
 from experiments.study.policies import find_policy, publish_policy
 from experiments.study.stages import encode_rows
 from sensors_io.schema import SENSORS
-from tests.experiments import tiny
 from tests.sensors_io.importers.films import film
 from touchr1_jax.asking import SHIPPED, TouchAnswer, TouchInput, compared, load_policy, shipped
 from touchr1_jax.models.saved_policy import PolicyError
@@ -187,10 +184,7 @@ def test_what_cannot_be_asked_is_one_line(runs, records, capsys):
         (("trial/latest/ordinal", "generated"), "has sft/0; name RUN/ARM/SEED"),
         (("no-such-run", records), "must be a run, RUN/ARM or RUN/ARM/SEED under"),
         (("trial", records, "--question", "How heavy is it?"), "it names no attribute"),
-        (
-            ("trial", records, "--question", "Which is harder?"),
-            "give two INPUTs, or ask about one, as in 'how hard",
-        ),
+        (("trial", records, "--question", "Which is harder?"), "give two INPUTs, or ask about one, as in 'how hard"),
         (("trial",), "must be at most one POLICY and one or two INPUTs"),
     ):
         assert ask(runs, *words) == 1
@@ -260,37 +254,6 @@ def test_the_demo_is_closed_to_other_pages_and_files(address, records):
     assert fetch(address, "video?name=a.avi", b"", **{"Content-Length": str(2**40)})[0] == 413
 
 
-def test_requests_of_no_browser_are_refused_without_a_word_in_the_terminal(address, capfd):
-    """Lengths that are none, an upload that ends early, a name that is no file's, addresses that are none."""
-    split = urllib.parse.urlsplit(address)
-    host = f"Host: {split.netloc}\r\n".encode()
-    for request, status in (
-        (b"POST /video?name=a.avi HTTP/1.1\r\n" + host + b"Content-Length: \xb2\r\n\r\n", b"413"),
-        (b"POST /video?name=a.avi HTTP/1.1\r\n" + host + b"Content-Length: 9\r\n\r\nabc", b"400"),
-        (b"POST /video?name=a.%00 HTTP/1.1\r\n" + host + b"Content-Length: 3\r\n\r\nabc", b"400"),
-        (b"GET http://[ HTTP/1.1\r\n" + host + b"\r\n", b"404"),
-        (b"GET / HTTP/1.1\r\nHost: [\r\n\r\n", b"403"),
-    ):
-        with socket.create_connection((split.hostname, split.port), timeout=10) as connection:
-            connection.sendall(request)
-            connection.shutdown(socket.SHUT_WR)
-            answer = b"".join(iter(lambda: connection.recv(65_536), b""))
-        assert answer.partition(b" ")[2].startswith(status), request
-    assert "Traceback" not in capfd.readouterr().err
-
-
-def test_a_run_whose_config_is_another_files_has_no_policy(tmp_path, capsys):
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "config.json").write_text("7")
-    assert ask(tmp_path, "run", "generated") == 1
-    assert "PolicyError: policy is " in capsys.readouterr().err
-
-
-def test_a_comparison_needs_two_touches_in_code_too(asked):
-    with pytest.raises(QuestionError, match="give two INPUTs"):
-        ask_policy(asked, [read_touch("generated:1", asked.saved)], "Which is harder?")
-
-
 def test_the_readme_asks_the_policy_of_the_package(capsys):
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     [snippet] = [block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "load_policy" in block]
@@ -303,7 +266,3 @@ def test_policies_of_the_package_are_small_and_have_a_card(name):
     files = {path.name: path.stat().st_size for path in (SHIPPED / name).iterdir()}
     assert sum(files.values()) < 800_000
     assert {"limits", "measured"} <= load_policy(name).saved.notes.keys()
-
-
-def test_tiny_scenes_are_noted(asked):
-    assert asked.saved.notes["scenes"]["image_px"] == tiny.SCENES.image_px

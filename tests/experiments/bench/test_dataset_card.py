@@ -87,19 +87,3 @@ def test_a_sample_is_drawn_by_command(directory, records, tmp_path):
     assert main(["audit-sheet", str(directory / "items.jsonl"), str(records), "--out", str(sheet), "--count", "5"]) == 0
     assert len(sheet.read_text().splitlines()) == 6
     assert len(read_json(sheet.with_suffix(".key.json"))) == 5
-
-
-def test_a_card_that_fails_writes_nothing(records, tmp_path, capsys):
-    few = [
-        "--identify",
-        "1",
-        *[p for kind in KINDS if kind != "identify" for p in (f"--{kind.replace('_', '-')}", "0")],
-    ]
-    assert main(["generate", str(records), "--out", str(tmp_path / "items.jsonl"), *few]) == 1
-    assert "objects never shown" in capsys.readouterr().err
-    assert not (tmp_path / "items.jsonl").exists()
-
-
-def test_a_known_error_is_one_line(tmp_path, capsys):
-    assert main(["generate", str(tmp_path), "--out", str(tmp_path / "items.jsonl")]) == 1
-    assert "MissingIndexError" in capsys.readouterr().err

@@ -44,12 +44,6 @@ def test_blank_sheets_hold_the_same_objects_in_other_orders(tmp_path):
         annotate.write_blank([tmp_path / "a.csv"], names, 0)
 
 
-def test_a_filled_in_sheet_is_read_as_levels(tmp_path):
-    annotate.write_blank([tmp_path / "a.csv"], OBJECTS, 0)
-    fill(tmp_path / "a.csv", in_words(labels()))
-    assert annotate.read_labels(tmp_path / "a.csv", OBJECTS) == labels()
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -143,19 +137,6 @@ def test_pass_rates_by_hand(items, source, tmp_path):
     assert agree == {"grounded": pytest.approx(0), "fits the labels": None, "self-consistent": 1.0}
 
 
-def test_audits_by_command(items, source, tmp_path, capsys):
-    path, sheet, key = tmp_path / "items.jsonl", tmp_path / "s.csv", tmp_path / "s.key.json"
-    write_items(path, items)
-    sample = audit.sample(items, 20, 1)
-    audit.write_blank(sheet, items, sample, source.bench.by_touch())
-    fill(sheet, lambda row: dict.fromkeys(audit.AXES, "yes"))
-    write_json(key, sample)
-    assert main(["audit", str(path), str(key), str(sheet), str(sheet)]) == 0
-    shown = capsys.readouterr().out
-    assert "100.0 %" in shown
-    assert "undefined" in shown
-
-
 def test_annotation_by_command(tmp_path, records, capsys):
     folder, objects = tmp_path / "labels", RecordStore(records).objects
     assert main(["annotate-sheets", str(records), "--out", str(folder)]) == 0
@@ -192,3 +173,16 @@ def test_a_file_that_is_none_of_ours_is_named(items, tmp_path, capsys, content):
         assert "Error: " in said
         assert str(wrong) in said
         assert len(said.splitlines()) == 1
+
+
+def test_audits_by_command(items, source, tmp_path, capsys):
+    path, sheet, key = tmp_path / "items.jsonl", tmp_path / "s.csv", tmp_path / "s.key.json"
+    write_items(path, items)
+    sample = audit.sample(items, 20, 1)
+    audit.write_blank(sheet, items, sample, source.bench.by_touch())
+    fill(sheet, lambda row: dict.fromkeys(audit.AXES, "yes"))
+    write_json(key, sample)
+    assert main(["audit", str(path), str(key), str(sheet), str(sheet)]) == 0
+    shown = capsys.readouterr().out
+    assert "100.0 %" in shown
+    assert "undefined" in shown

@@ -96,23 +96,6 @@ def test_two_runs_of_one_experiment(home, capsys):
     assert "Cost: A " in out
 
 
-def test_figures_that_runs_share_come_first(home, capsys):
-    first, second = stamps(home)
-    path = home / "coin" / second / "results.json"
-    text = path.read_text()
-    try:
-        changed = read_json(path)
-        changed["arms"]["other"] = changed["arms"].pop("paid")
-        changed["arms"]["unpaid"]["acc"]["per_seed"][0] += 1
-        write_sealed(path, changed)
-        assert main(["compare", f"coin/{first}", f"coin/{second}", "--runs-dir", str(home)], package=FAKES) == 0
-    finally:
-        path.write_text(text)
-    out = capsys.readouterr().out
-    table = out[out.index("figure  ") :]
-    assert table.index("unpaid acc") < table.index("only in A")
-
-
 def test_the_gravest_differences_come_first_and_the_others_are_counted(home, capsys):
     first, second = (home / "coin" / stamp / "results.json" for stamp in stamps(home))
     text = second.read_text()

@@ -2,16 +2,14 @@
 
 import contextlib
 import io
-import time
 
 import numpy as np
 import pytest
 from rich.console import Console
 
 from experiments.core.artifacts import DamagedFileError
-from experiments.core.context import Context, MetricLog, read_metrics
-from experiments.core.progress import Loop, in_megabytes, show_progress
-from experiments.core.timing import interleaved
+from experiments.core.context import MetricLog, read_metrics
+from experiments.core.progress import Loop, show_progress
 
 
 def log_steps(path, stage, steps):
@@ -51,15 +49,6 @@ def test_several_lines_of_one_step_are_kept_and_bad_ones_named(context):
     log.close()
 
 
-@pytest.mark.parametrize("flipped", [b"\xdd", b"{"], ids=["no UTF-8", "no JSON"])
-def test_a_log_with_a_flipped_byte_is_named(context, flipped):
-    context.log("sft/0", 0, loss=1.0)
-    path = context.directory / "metrics.jsonl"
-    path.write_bytes(path.read_bytes()[:9] + flipped + path.read_bytes()[10:])
-    with pytest.raises(DamagedFileError, match=r"metrics.jsonl is damaged .* start a new run with --fresh"):
-        read_metrics(context.directory)
-
-
 def test_every_flipped_bit_of_a_log_is_named_or_harmless(tmp_path):
     """The end of the last line too, without which a line that was torn by a crash is dropped."""
     path = tmp_path / "metrics.jsonl"
@@ -72,13 +61,6 @@ def test_every_flipped_bit_of_a_log_is_named_or_harmless(tmp_path):
         with contextlib.suppress(DamagedFileError):
             MetricLog(path).close()
             assert read_metrics(tmp_path) == rows, bit
-
-
-def test_lines_of_earlier_versions_have_no_checksum_and_are_read(context):
-    context.log("sft/0", 0, loss=1.0)
-    path = context.directory / "metrics.jsonl"
-    path.write_text(path.read_text() + '{"stage": "sft/0", "step": 1, "loss": 0.5}\n')
-    assert [row["loss"] for row in read_metrics(context.directory)] == [1.0, 0.5]
 
 
 @pytest.mark.parametrize("stage", ["", "/sft", "sft/", "../sft", "sft/..", "a b", "sft//0"])
@@ -159,63 +141,3 @@ def test_the_first_step_bounds_the_time_left_and_later_ones_give_it():
     assert loop.rate == 0.5
     loop.advance(9)
     assert loop.left == ""
-
-
-def test_bars_that_are_still_and_those_inside_are_drawn_with_their_steps_alone(tmp_path):
-    """A bar that draws itself ten times a second would take time from what is timed."""
-    console = Console(file=io.StringIO(), force_terminal=True, width=120)
-    context = Context(tmp_path, tmp_path / "cache", console)
-    for _ in context.rounds("timing", 1):
-        for step in context.each("programs", range(2)):
-            before = console.file.getvalue()
-            assert f"{step}/2" in before
-            time.sleep(0.3)
-            assert console.file.getvalue() == before
-    assert "1/1" in console.file.getvalue()
-    context.close()
-
-
-def test_a_loop_that_reports_by_callback_is_shown_from_its_first_report(context):
-    with context.progress_callback("contacts") as report:
-        assert not context.loops
-        report(4, 10)  # an earlier session's
-        (loop,) = context.loops
-        assert (loop.completed, loop.total, loop.rate) == (4, 10, 0.0)
-        report(7, 10)
-        report(7, 10)
-        assert loop.completed == 7
-        assert loop.rate > 0
-    assert not context.loops
-    assert "contacts: 7/10" in context.console.file.getvalue()
-
-
-def test_items_one_after_the_other_count_when_the_next_is_requested(context):
-    seen = [(item, context.loops[0].completed) for item in context.each("panels", "abc")]
-    assert seen == [("a", 0), ("b", 1), ("c", 2)]
-    assert not context.loops
-    assert "panels: 3/3" in context.console.file.getvalue()
-
-
-def test_bytes_are_reported_in_megabytes_and_end_at_all_of_them():
-    reports: list[tuple[int, int]] = []
-    report = in_megabytes(lambda *megabytes: reports.append(megabytes))
-    for done in (0, 1, 2_000_000, 2_500_000):
-        report(done, 2_500_000)
-    assert reports == [(0, 3), (1, 3), (2, 3), (3, 3)]
-
-
-def test_calls_take_turns_and_only_they_are_timed():
-    order: list[str] = []
-
-    def taking(name: str, seconds: float):
-        return lambda: order.append(name) or time.sleep(seconds)
-
-    def rounds():
-        for _ in range(2):
-            time.sleep(0.2)  # a bar is drawn
-            yield
-
-    found = interleaved({"a": taking("a", 0.01), "b": taking("b", 0.04)}, rounds())
-    assert order == ["a", "b", "a", "b"]
-    assert all(0.01 <= s < 0.2 for s in found["a"])
-    assert all(0.04 <= s < 0.2 for s in found["b"])

@@ -3,11 +3,10 @@
 import json
 import signal
 
-import jax.numpy as jnp
 import pytest
 
 from experiments.core.artifacts import read_json
-from experiments.core.loops import left_out_tables, run_loop
+from experiments.core.loops import left_out_tables
 from experiments.faults.digests import differences, digests
 from experiments.faults.fixtures import run_counting, run_directory
 from experiments.faults.trainings import counting
@@ -25,10 +24,7 @@ def whole(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize(
-    ("number", "code"), [(signal.SIGTERM, 143), pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow)]
-)
-def test_a_signal_ends_the_run_after_the_step_is_saved(whole, tmp_path, capsys, monkeypatch, number, code):
+def test_a_signal_ends_the_run_after_the_step_is_saved(whole, tmp_path, capsys, monkeypatch):
     """Step 5 of 12, while the batch of step 6 is made; every fourth is saved: nothing computed is computed again."""
     made = counting.targets
 
@@ -39,7 +35,7 @@ def test_a_signal_ends_the_run_after_the_step_is_saved(whole, tmp_path, capsys, 
         def __next__(self):
             self._left -= 1
             if not self._left:
-                signal.raise_signal(number)
+                signal.raise_signal(signal.SIGTERM)
             return next(self._targets)
 
         def __iter__(self):
@@ -50,9 +46,9 @@ def test_a_signal_ends_the_run_after_the_step_is_saved(whole, tmp_path, capsys, 
 
     with monkeypatch.context() as patch:
         patch.setattr(counting, "targets", Struck)
-        assert run_counting(tmp_path) == code
+        assert run_counting(tmp_path) == 143
     output = capsys.readouterr().out
-    assert f"Stopped by {number.name}" in output
+    assert "Stopped by SIGTERM" in output
     assert "To continue: python -m experiments counting" in output
     assert [line["step"] for line in lines(tmp_path)] == list(range(6))
     assert (run_directory(tmp_path) / "checkpoints" / "count" / "0" / "6").is_dir()
@@ -82,23 +78,6 @@ def test_groups_that_a_reward_left_out_are_counted_for_each_stage():
     (table,) = left_out_tables(lines)
     assert table.rows == (("grpo/a/0", 2, 0.0, "spread 25.0%"),)
     assert left_out_tables(lines[1:]) == ()
-
-
-def test_the_best_checkpoint_is_kept_with_the_newest(context):
-    """Held-out scores fall from step 4 on, so that its checkpoint outlives two newer ones."""
-    config = counting.CountingConfig()
-    seen = []
-    run_loop(
-        lambda state, target: (state | {"step": state["step"] + 1}, {"loss": jnp.mean(target)}),
-        {"step": jnp.int32(0)},
-        counting.targets(config),
-        config.loop(),
-        context,
-        "count/0",
-        held_out=lambda state: seen.append(int(state["step"])) or -float(state["step"]),
-    )
-    kept = sorted(int(path.name) for path in (context.directory / "checkpoints/count/0").iterdir())
-    assert seen == kept == [4, 8, 12]
 
 
 # Orbax gives up at the first array that it cannot read; what the others call back then finds its loop closed

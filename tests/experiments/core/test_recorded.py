@@ -55,11 +55,6 @@ def test_a_figure_that_no_run_gives_is_refused(root, name, path, spec, message):
         figure(name, path, spec, root)
 
 
-def test_a_document_without_the_block_is_refused(root):
-    with pytest.raises(FigureError, match="must hold one"):
-        filled("text", root)
-
-
 def test_a_finished_run_is_recorded_whole_but_for_paths_of_the_machine(root, tmp_path, capsys):
     recorded = read_json(root / RECORDED / "coin.json")
     assert recorded == RESULTS | {"config": {"data_dir": "x", "paths": ["b.npz", "1/2", "/"]}}

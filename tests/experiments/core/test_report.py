@@ -1,35 +1,19 @@
 """The report is one well-formed page that needs nothing from outside and trusts no text."""
 
-import base64
 import dataclasses
 import re
-import shutil
-import subprocess
 from html.parser import HTMLParser
 
-import cv2
 import numpy as np
 import pytest
 
 from experiments.core.artifacts import write_text
-from experiments.core.report import is_best, jpeg, pieces, png, strip, write_report
+from experiments.core.report import is_best, pieces, write_report
 from experiments.core.results import Comparison, Estimate, Picture, Results, Trace, named_table
 from experiments.core.text import MEANINGLESS, SMOKE
 from tests.experiments.core.test_results import FAST, SLOW
 from tests.experiments.fakes import coin
 from touchr1_jax.bench.metrics import METRICS
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-
-ASK = """<script>window.addEventListener("load", () => {
-  const images = [...document.images], root = document.documentElement;
-  document.body.dataset.seen = JSON.stringify({
-    images: images.length, broken: images.filter(i => !i.naturalWidth || !i.width).length,
-    wide: root.scrollWidth > root.clientWidth, requests: performance.getEntriesByType("resource")
-      .filter(e => !e.name.startsWith("data:")).length,
-    marks: document.querySelectorAll(".rollout mark").length, instead: document.querySelectorAll("td .trace").length});
-});</script>"""
-"""Asks the browser what it shows; only the copy that the test opens has it."""
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
 SVG = b'<svg xmlns="http://www.w3.org/2000/svg" width="9" height="9"/>'
@@ -117,12 +101,6 @@ def write(directory, results, about="Does it?\n\nPerhaps.", description=DESCRIPT
     return write_report(directory, results, about=about, description=description).read_text()
 
 
-def test_answers_are_marked_right_or_wrong_with_other_arms_beside_them(tmp_path, results):
-    page = write(tmp_path, results)
-    assert page.count("✓ right") == 1
-    assert re.search(r"unpaid</th><td> *<span class=\"wrong\">✗ wrong</span>", page.replace("\n", ""))
-
-
 def test_the_page_is_well_formed_whole_and_loads_nothing(tmp_path, results):
     page = write(tmp_path, results)
     reader = read(page)
@@ -131,6 +109,7 @@ def test_the_page_is_well_formed_whole_and_loads_nothing(tmp_path, results):
     assert not {"script", "link", "iframe"} & reader.seen
     for text in (
         "Does it?", "Being paid helps.", "paid", "unpaid", "blind", "preset paper", "lr_scale 100", "loss",
+        "<th>sft</th><td>2</td><td>2.0</td><td>4.0</td>",
         "NOT MET", "≥ 400 records/s", "−2.00", "winkler", "–", "left is faster", "Fields of xense",
     ):  # fmt: skip
         assert text in reader.text or text in page
@@ -149,34 +128,6 @@ def test_a_smoke_page_says_that_its_figures_mean_nothing(tmp_path, results):
     assert "Being paid helps." not in text
     assert "Requirements" not in text
     assert MEANINGLESS not in read(write(tmp_path, results)).text
-
-
-def test_unknown_forces_are_left_out_and_none_is_minus_zero(tmp_path, results):
-    def forces(force_n: np.ndarray) -> list[str]:
-        example = dataclasses.replace(coin.example(), force_n={"xense": force_n})
-        return re.findall(r"<span>([^<]* N)</span>", write(tmp_path, dataclasses.replace(results, examples=(example,))))
-
-    assert forces(np.zeros((3, 3))) == []
-    assert forces(np.array([[0, 0, 0.0], [0, 0, 0.01], [0, 0, -2.0]])) == ["0.0 N", "0.0 N", "2.0 N"]
-
-
-def test_a_page_of_a_long_run_stays_small(tmp_path, results):
-    rng = np.random.default_rng(0)
-    stages = [f"grpo/{arm}/{seed}" for arm in ("paid", "unpaid", "a", "b") for seed in range(5)]
-    scalars = [f"scalar{i}" for i in range(8)]
-    lines = [
-        f'{{"stage": "{stage}", "step": {t}, ' + ", ".join(f'"{s}": {rng.normal():.4f}' for s in scalars) + "}\n"
-        for stage in stages
-        for t in range(900)
-    ]
-    noisy = np.linspace(60, 180, 64)[:, None] + rng.normal(0, 3, (8, 48, 64, 3))
-    frames = dict.fromkeys("abcd", noisy.astype(np.uint8))
-    examples = (dataclasses.replace(coin.example(), frames=frames),) * 12
-    write_text(tmp_path / "metrics.jsonl", "".join(lines))
-    page = write_report(
-        tmp_path, dataclasses.replace(results, examples=examples), about="Does it?", description=DESCRIPTION
-    )
-    assert page.stat().st_size < 3_000_000
 
 
 def test_hostile_text_stays_text(tmp_path, results):
@@ -228,46 +179,8 @@ def test_a_text_is_cut_at_its_segments():
     ]  # fmt: skip
 
 
-def test_a_strip_holds_every_frame_in_its_colours(tmp_path, results):
-    frames = (
-        np.zeros((3, 8, 8, 3), np.uint8) + np.array([200, 40, 90], np.uint8) // np.arange(1, 4)[:, None, None, None]
-    )
-    frames = frames.astype(np.uint8)
-    for encode, error in ((png, 0), (jpeg, 6)):
-        shown = cv2.imdecode(np.frombuffer(encode(strip(frames)), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
-        assert shown.shape == (8, 3 * 10, 3)
-        for f in range(3):
-            assert np.abs(shown[2:6, 10 * f + 3 : 10 * f + 7].astype(int) - frames[f, 2:6, 2:6]).max() <= error
-    embedded = re.findall(r"data:image/jpeg;base64,([A-Za-z0-9+/=]+)", write(tmp_path, results))
-    assert base64.b64decode(embedded[0]) == jpeg(strip(coin.example().frames["xense"]))
-
-
 def test_rollouts_of_a_group_fold_away_under_its_heading(tmp_path, results):
-    def section(*groups: str) -> str:
-        examples = tuple(dataclasses.replace(coin.example(), group=group) for group in groups)
-        page = write(tmp_path, dataclasses.replace(results, examples=examples))
-        return page[page.index("A few rollouts") : page.index("Data and time")]
-
-    grouped = section(HOSTILE, HOSTILE, "far off", "")
-    assert grouped.count("<b>Question </b>") == 4
-    assert grouped.count("<details") == 2
-    assert grouped.count('<details open="open">') == 1
-    assert grouped.index("far off") > grouped.rindex("alert(")
-    assert "<script>" not in grouped
-    assert "<details" not in section("")
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium here")
-def test_a_browser_shows_all_of_it(tmp_path, results):
-    asked = tmp_path / "asked.html"
-    asked.write_text(write(tmp_path, results).replace("</body>", f"{ASK}</body>"), encoding="utf-8")
-    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--window-size=1000,2000", "--virtual-time-budget=5000"]
-    command = [str(CHROMIUM), *flags, f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", asked.as_uri()]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
-    (seen,) = re.findall(r'data-seen="([^"]*)"', done.stdout)
-    found = dict(re.findall(r"&quot;(\w+)&quot;:(\w+)", seen))
-    assert int(found["images"]) >= 6  # view, frames, fields, charts
-    assert found["broken"] == found["requests"] == "0"
-    assert found["wide"] == "false"
-    assert (int(found["marks"]), found["instead"]) == (9, "2")
+    examples = tuple(dataclasses.replace(coin.example(), group=group) for group in (HOSTILE, HOSTILE, "far off", ""))
+    page = write(tmp_path, dataclasses.replace(results, examples=examples))
+    found = [page.count(text) for text in ("<b>Question </b>", "<details", '<details open="open">', "<script")]
+    assert found == [4, 2, 1, 0]

@@ -1,26 +1,17 @@
 """The command line end to end: finding, overriding, running, continuing, stopping."""
 
 import dataclasses
-import json
-import os
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
-import jax
 import pytest
 
 from experiments.core import runs
 from experiments.core.artifacts import read_json
-from experiments.core.commands import find
 from experiments.core.runner import Experiment, main, parse, run_experiment
 from tests.experiments.fakes import coin
 from touchr1_jax.rl.config import AnyAlgorithm, Dapo, Paper
 
 FAKES = "tests.experiments.fakes"
-ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture(autouse=True)
@@ -62,12 +53,6 @@ def test_names_are_listed_and_typos_answered_with_the_right_one(capsys, argument
     assert printed in "".join(capsys.readouterr())
 
 
-def test_the_modules_of_the_runner_are_no_experiments():
-    assert not {"runner", "report", "context", "results"} & set(find("experiments"))
-    with pytest.raises(ModuleNotFoundError, match="no such package"):
-        find("tests.experiments.nowhere")
-
-
 @pytest.mark.parametrize("scales", [{"default": coin.Config()}, {"smoke": coin.Toss()}])
 def test_the_scales_of_an_experiment_are_of_one_kind(scales):
     with pytest.raises(ValueError, match="coin"):
@@ -95,16 +80,6 @@ def test_a_run_leaves_the_agreed_files(capsys):
     assert results["timing"]["total"] >= results["timing"]["train/paid/0"] > 0
     assert {p.name for p in (directory / "plots").iterdir()} == {"curves_train.svg", "accuracy_against_middle.svg"}
     assert "report.html" in capsys.readouterr().out
-
-
-def test_compiled_programs_are_kept_with_the_data():
-    session = jax.config.values["jax_compilation_cache_dir"]
-    jax.config.update("jax_compilation_cache_dir", None)
-    try:
-        assert run("coin", "--scale=smoke", "--cache-dir", "elsewhere") == 0
-    finally:
-        jax.config.update("jax_compilation_cache_dir", session)
-    assert list(Path("elsewhere/compiled").iterdir())
 
 
 def test_a_crashed_run_is_continued_to_the_same_files(monkeypatch, capsys):
@@ -155,30 +130,6 @@ def test_a_run_directory_serves_one_process_at_a_time(monkeypatch, capsys):
     assert "another process" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_stops_cleanly_and_prints_how_to_continue(workplace, number, code):
-    program = f"import sys; from experiments.core.runner import main; sys.exit(main(sys.argv[1:], package={FAKES!r}))"
-    process = subprocess.Popen(
-        [sys.executable, "-c", program, "coin", "--step-s", "0.05", "--fresh"],
-        cwd=workplace, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    deadline = time.monotonic() + 60
-    while not list(workplace.glob("runs/coin/*/checkpoints/train/paid/0/state.json")):
-        assert process.poll() is None, "the run ended before it could be stopped"
-        assert time.monotonic() < deadline, "the run did not start"
-        time.sleep(0.02)
-    process.send_signal(number)
-    out, _ = process.communicate(timeout=60)
-    assert process.returncode == code
-    assert "To continue: python -m experiments coin --step-s 0.05" in out
-    assert "--fresh" not in out.splitlines()[-1]
-    (directory,) = (p for p in workplace.glob("runs/coin/*") if not p.is_symlink())
-    lines = (directory / "metrics.jsonl").read_text().splitlines()
-    assert [json.loads(line)["step"] for line in lines] == list(range(len(lines)))
-    assert not (directory / "results.json").exists()
-    assert not list(directory.rglob(".*.json.*")), "half-written files were left behind"
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Learning:
     algorithm: AnyAlgorithm = Paper()
@@ -206,15 +157,6 @@ LEARNING = Experiment(name="learning", config=LearningConfig(), run=coin.run)
 def test_options_of_a_choice_stand_anywhere(arguments, expected):
     command = parse(LEARNING, arguments.split(), "about")
     assert command.config.grpo.algorithm == expected
-
-
-def test_help_shows_what_matters_first_and_counts_the_rest(capsys):
-    for flag, most in (("--help", 45), ("--help-all", 1000)):
-        with pytest.raises(SystemExit):
-            parse(LEARNING, [flag], "about")
-        lines = capsys.readouterr().out.splitlines()
-        assert len(lines) <= most
-    assert any("--grpo.algorithm.beta" in line for line in lines)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 from experiments.core.artifacts import read_json
 from experiments.core.runner import main
 from experiments.core.runs import locate
-from experiments.core.sweep import SweepError, chart, chosen_figures, options_of, plan
+from experiments.core.sweep import SweepError, chart, chosen_figures, plan
 from experiments.core.sweep import main as sweep
 from tests.experiments.core.test_report import read
 from tests.experiments.fakes import coin
@@ -58,17 +58,7 @@ def test_a_stopped_sweep_goes_on_and_runs_nothing_twice(workplace, monkeypatch, 
 
 def test_a_sweep_with_more_values_keeps_what_its_folder_holds(workplace, capsys):
     for values in ("2", "2,3"):
-        arguments = (
-            "coin",
-            "--vary",
-            f"seeds={values}",
-            "--steps",
-            "1",
-            "--into",
-            "mine",
-            "--figures",
-            "omae",
-        )
+        arguments = ("coin", "--vary", f"seeds={values}", "--steps", "1", "--into", "mine", "--figures", "omae")
         assert sweep(arguments, package=FAKES) == 0
     out = capsys.readouterr().out
     assert "1 of 2, seeds 2: finished before" in out
@@ -105,12 +95,6 @@ def test_a_mistyped_option_or_value_runs_nothing(workplace, capsys):
     assert sweep(["coyn", "--vary", "steps=1"], package=FAKES) == 2
     assert "Did you mean coin?" in capsys.readouterr().err
     assert not list(workplace.iterdir())
-
-
-def test_flags_words_and_pairs_vary():
-    assert options_of(["--grpo.lr_scale=50, 100"]) == {"grpo.lr-scale": ("50", "100")}
-    _, units = plan(coin.EXPERIMENT, "about", ["coin=gold,silver", "toss.bias=.5"], ["--steps=2"], Path("r"), None)
-    assert [u.command[:4] for u in units] == [("--steps=2", "--coin", m, "--toss.bias") for m in ("gold", "silver")]
 
 
 def estimate(mean: float) -> dict:

@@ -4,8 +4,8 @@ import itertools
 import re
 import struct
 import sys
-import time
 from types import SimpleNamespace
+from unittest.mock import Mock, call
 
 import pytest
 from tensorboardX.proto.event_pb2 import Event, SessionLog
@@ -13,16 +13,7 @@ from tensorboardX.proto.event_pb2 import Event, SessionLog
 from experiments.core.context import Context, MetricLog
 from experiments.core.progress import TrainingSample
 from experiments.core.runner import main
-from experiments.core.watchers import (
-    CURVES_SHARE,
-    MOST_PANELS,
-    PAGE_EVERY_S,
-    SAMPLES,
-    TENSORBOARD,
-    WANDB,
-    Events,
-    LivePage,
-)
+from experiments.core.watchers import CURVES_SHARE, PAGE_EVERY_S, SAMPLES, TENSORBOARD, WANDB, Events, LivePage
 from tests.experiments.core.test_report import DESCRIPTION, HOSTILE, read
 
 FAKES = "tests.experiments.fakes"
@@ -93,16 +84,6 @@ def test_the_page_shows_what_the_policy_answers(tmp_path, console):
     context.close()
 
 
-def test_without_a_choice_the_first_scalars_are_drawn(tmp_path, console):
-    clock = Clock()
-    _, context = watched(tmp_path, console, clock)
-    clock.now += PAGE_EVERY_S
-    context.log("sft/0", 0, **{f"s{i:02}": i for i in range(20)})
-    names = ", ".join(f"s{i:02}" for i in range(MOST_PANELS))
-    assert f'alt="Training curves of sft: {names}"' in shown(context)
-    context.close()
-
-
 def test_curves_take_their_share_of_the_time_and_pages_stay_fresh(tmp_path, console):
     """Every look at the clock takes a second, so that curves take one and pages follow after ten."""
     page, context = watched(tmp_path, console, itertools.count().__next__)
@@ -115,18 +96,6 @@ def test_curves_take_their_share_of_the_time_and_pages_stay_fresh(tmp_path, cons
     assert 1 <= len(curves) <= 1 + 700 * CURVES_SHARE
     page.end(RuntimeError("over"))
     assert set(re.findall(r"base64,([^\"]*)", shown(context))) - curves  # the last page has all lines
-    context.close()
-
-
-def test_the_page_is_written_while_nothing_happens(tmp_path, console):
-    clock = Clock()
-    page, context = watched(tmp_path, console, clock)
-    before = shown(context)
-    with page.kept_fresh(every_s=0.001):
-        clock.now += PAGE_EVERY_S
-        while shown(context) == before:
-            time.sleep(0.001)
-    assert "10 s so far" in shown(context)
     context.close()
 
 
@@ -193,25 +162,9 @@ def test_a_run_writes_events_when_asked_and_needs_the_package(tmp_path, monkeypa
     assert sorted(tmp_path.glob("runs/coin/*")) == runs
 
 
-class FakeRun:
-    """A run of Weights & Biases that keeps what it is sent."""
-
-    def __init__(self):
-        self.metrics, self.lines, self.ended = {}, [], 0
-
-    def define_metric(self, name, step_metric):
-        self.metrics[name] = step_metric
-
-    def log(self, values):
-        self.lines.append(values)
-
-    def finish(self):
-        self.ended += 1
-
-
 def test_a_run_sends_its_figures_when_asked_and_goes_on_in_the_same_place(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    orders, sent = [], FakeRun()
+    orders, sent = [], Mock()  # a run of Weights & Biases
     monkeypatch.setitem(sys.modules, WANDB, SimpleNamespace(init=lambda **order: (orders.append(order), sent)[1]))
     arguments = ["coin", "--steps", "6", "--seeds", "2", "--crash-at", "5", "--wandb"]
     monkeypatch.setenv("COIN_CRASHES", "1")
@@ -222,10 +175,10 @@ def test_a_run_sends_its_figures_when_asked_and_goes_on_in_the_same_place(tmp_pa
     assert orders[0] == orders[1]
     assert orders[0]["id"] == f"coin-{(tmp_path / 'runs/coin/latest').resolve().name}"
     assert orders[0]["config"]["steps"] == 6
-    assert sent.metrics["train/unpaid/1/*"] == "train/unpaid/1/step"
-    steps = [line["train/paid/0/step"] for line in sent.lines if "train/paid/0/reward" in line]
-    assert steps == [0, 1, 2, 3, 4, 5]
-    assert sent.ended == 2
+    assert call("train/unpaid/1/*", step_metric="train/unpaid/1/step") in sent.define_metric.mock_calls
+    lines = [one.args[0] for one in sent.log.mock_calls]
+    assert [line["train/paid/0/step"] for line in lines if "train/paid/0/reward" in line] == [0, 1, 2, 3, 4, 5]
+    assert sent.finish.call_count == 2
     monkeypatch.setitem(sys.modules, WANDB, None)
     assert main(arguments, package=FAKES) == 2
     assert "pip install 'touchr1-jax[wandb]'" in capsys.readouterr().err

@@ -1,21 +1,11 @@
 """Variants of the encoder: their tokens, the choice among them, the report of all, shrunk."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
-from experiments.core.artifacts import read_json
-from experiments.encoder import pareto_encoder
 from experiments.encoder.pareto_encoder import MeasuredVariant, choose, loss, part_table
-from experiments.encoder.pretrain import StageOneDataConfig
 from experiments.encoder.speed import CompiledProgram
-from experiments.encoder.variants import REFERENCE, STUDIED, FieldsOnly, variants
-from sensors_io.pipeline import make_clip
-from tests.experiments import tiny
-from tests.experiments.shrunk import run_shrunk
-from touchr1_jax.models.predictor import PredictorConfig
-from touchr1_jax.training.linear_probe import ProbeConfig
+from experiments.encoder.variants import REFERENCE, STUDIED, variants
 from touchr1_jax.training.pretraining import PretrainConfig
 
 VARIANTS = {v.name: v for v in variants(PretrainConfig(frames=8))}
@@ -49,16 +39,6 @@ def test_parts_add_up_to_the_whole():
     np.testing.assert_allclose(table.rows[1][4], 0.4 / 0.004 / 200)
 
 
-def test_fields_take_the_place_of_pictures(data):
-    fields, card = FieldsOnly(data.store), data.store.objects[data.object_ids[0]]
-    clip = make_clip(fields.contact(0, fields=False), card, data.clip)
-    pictures = make_clip(data.store.contact(0), card, data.clip)
-    assert clip.frames.shape == pictures.frames.shape
-    assert (clip.frames[0] != pictures.frames[0]).any()
-    np.testing.assert_array_equal(clip.force_n, pictures.force_n)
-    assert len(fields) == len(data.store)
-
-
 @pytest.mark.parametrize(
     ("tokens", "names"),
     [
@@ -74,25 +54,3 @@ def test_variants_have_their_tokens(tokens, names):
     assert {name for name, variant in VARIANTS.items() if variant.tokens == tokens} == names
     studied, default = VARIANTS[STUDIED].config, PretrainConfig()
     assert (studied.encoder, studied.frames_kept) == (default.encoder, default.frames)
-
-
-@pytest.mark.slow
-def test_every_variant_is_reported(tmp_path, cache_dir):
-    config = pareto_encoder.ParetoEncoderConfig(
-        touch=StageOneDataConfig(
-            scenes=dataclasses.replace(tiny.SCENES, frames=8), probe=ProbeConfig(folds=2, iterations=2)
-        ),
-        pretrain=PretrainConfig(
-            encoder=dataclasses.replace(PretrainConfig().encoder, width=12, num_layers=1),
-            predictor=PredictorConfig(width=12, num_layers=1),
-            frames=8,
-            steps=1,
-            batch_size=2,
-            probe_every=1,
-        ),
-        rounds=1,
-    )
-    directory = run_shrunk(pareto_encoder, config, tmp_path, "--cache-dir", str(cache_dir))
-    results = read_json(directory / "results.json")
-    assert [row[0] for row in results["tables"][0]["rows"]] == list(VARIANTS)
-    assert (directory / "plots" / "pareto_encoder.svg").exists()

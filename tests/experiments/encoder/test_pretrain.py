@@ -1,7 +1,7 @@
-"""Stage 1 as a stage and on the command line, shrunk: it resumes bit for bit, and a study starts from its encoder."""
+"""Stage 1 as a stage and on the command line, shrunk: it goes on where it stopped; a study starts from its encoder."""
 
+import contextlib
 import dataclasses
-import io
 
 import jax
 import numpy as np
@@ -11,7 +11,7 @@ from rich.console import Console
 from experiments.core.artifacts import read_json
 from experiments.core.context import Context, read_metrics
 from experiments.encoder import pretrain_encoder
-from experiments.encoder.pretrain import StageOneDataConfig, held_out_contacts, points, pretrain
+from experiments.encoder.pretrain import StageOneDataConfig, held_out_contacts, pretrain
 from experiments.study.stages import run_sft
 from experiments.study.training import starting_model
 from tests.experiments import tiny
@@ -33,51 +33,29 @@ PRETRAIN = PretrainConfig(
 DATA = StageOneDataConfig(scenes=tiny.SCENES, probe_fit=6, probe=ProbeConfig(folds=2, iterations=3))
 
 
-class Stop(RuntimeError):
-    """The machine went away."""
-
-
 class StoppedContext(Context):
     """A run that stops after the first checkpoint, before the measurement that follows it."""
 
     def done(self, stage):
         if stage == "probe/0/at2":
-            raise Stop
+            raise KeyboardInterrupt
         return super().done(stage)
 
 
-def run(data, directory, context_class=Context):
-    """Pretrain for four steps, measured every two; the state and the logged lines."""
-    context = context_class(directory, directory, Console(file=io.StringIO()))
+def test_a_stopped_run_goes_on_and_is_measured_before_during_and_after(data, tmp_path):
     held_out, config = held_out_contacts(data, "test", DATA), dataclasses.replace(PRETRAIN, steps=4)
-    stage = {"stage": "dynamics/0", "seed": 0}
-    try:
-        state = pretrain(config, data.store, data.parts["sft"], data.clip, context, **stage, held_out=held_out)
-    finally:
+    for kind in (StoppedContext, Context):
+        context = kind(tmp_path, tmp_path, Console(quiet=True))
+        order = {"stage": "dynamics/0", "seed": 0, "held_out": held_out}
+        with contextlib.suppress(KeyboardInterrupt):
+            pretrain(config, data.store, data.parts["sft"], data.clip, context, **order)
         context.close()
-    return state, read_metrics(directory)
-
-
-@pytest.fixture(scope="module")
-def whole(data, tmp_path_factory):
-    return run(data, tmp_path_factory.mktemp("whole"))
-
-
-def test_it_measures_before_during_and_after(whole):
-    lines = [line for line in whole[1] if line["stage"] == "probe/0"]
-    assert [line["step"] for line in lines] == [0, 2, 4]
-    assert "probe_lead" not in lines[0]
-    np.testing.assert_allclose(lines[2]["probe_lead"], lines[2]["probe"] - lines[0]["probe"])
-    assert [line["step"] for line in whole[1] if line["stage"] == "dynamics/0"] == [0, 1, 2, 3]
-
-
-def test_a_stopped_run_resumes_bit_for_bit(whole, data, tmp_path):
-    with pytest.raises(Stop):
-        run(data, tmp_path, StoppedContext)
-    state, lines = run(data, tmp_path)
-    jax.tree.map(np.testing.assert_array_equal, state.params, whole[0].params)
-    key = lambda line: (line["stage"], line["step"])
-    assert sorted(lines, key=key) == sorted(whole[1], key=key)
+    logged = read_metrics(tmp_path)
+    assert [line["step"] for line in logged if line["stage"] == "dynamics/0"] == [0, 1, 2, 3]
+    before, during, after = (line for line in logged if line["stage"] == "probe/0")
+    assert [before["step"], during["step"], after["step"]] == [0, 2, 4]
+    assert "probe_lead" not in before
+    np.testing.assert_allclose(after["probe_lead"], after["probe"] - before["probe"])
 
 
 @pytest.fixture(scope="module")
@@ -105,8 +83,3 @@ def test_a_study_starts_from_it(directory, data, context):
     params = run_sft(policy, data, evidence, untouched, context, seed=0, stage="sft/0", start={"tactile": tactile})
     jax.tree.map(np.testing.assert_array_equal, params["tactile"], load_encoder(directory).params)
     assert starting_model(tiny.STUDY.model, None, data.clip.sensors) == (tiny.STUDY.model, None)
-
-
-def test_points_pool_attributes_by_object():
-    found = points(np.array([[True, False], [True, True], [False, False]]), np.array([0, 0, 1]))
-    assert (found.mean, found.low, found.high) == (50, 0, 75)

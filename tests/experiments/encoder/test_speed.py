@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.encoder.speed import MATRIX, by_contact, matrix_product, medians, parts
+from experiments.encoder.speed import by_contact, parts
 from tests.experiments import tiny
 from touchr1_jax.models.predictor import PredictorConfig
 from touchr1_jax.models.tactile_vit import TactileViT, TactileViTConfig
@@ -54,9 +54,3 @@ def test_arithmetic_is_that_of_all_contacts():
     rows = 2 * 3 * 10 * 10 * 3 // 5
     np.testing.assert_allclose(few.gflop, 2e-9 * rows * 5 * 7, rtol=0.1)  # and some for the cast to float
     np.testing.assert_allclose(many.gflop, 4 * few.gflop)
-
-
-def test_the_yardstick_is_one_product():
-    product = matrix_product()
-    np.testing.assert_allclose(product.gflop, 2e-9 * MATRIX**3)
-    assert medians({"product": product}, range(2))["product"] > 0

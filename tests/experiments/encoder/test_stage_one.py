@@ -1,15 +1,12 @@
-"""Stage 1 compared: measures of depth, choices on validation objects, and a shrunken run."""
-
-import dataclasses
+"""Objectives without labels compared, collapse, and predicted frames: their arithmetic by hand values."""
 
 import numpy as np
-import pytest
 
-from experiments.encoder import stage_one
 from experiments.encoder.pretrain import depth_measures
-from experiments.encoder.stage_one import StageOneConfig, at_steps, chosen_steps, lead
-from experiments.faults.trainings.small_study import MODEL, SCENES
-from tests.experiments.shrunk import run_shrunk
+from experiments.encoder.stability_encoder import ARMS, CollapseOutcome
+from experiments.encoder.stage_one import at_steps, chosen_steps, lead
+from experiments.encoder.video_prediction import FrameScores, mean_frames
+from sensors_io.pipeline import clip_batches
 
 
 def test_measures_of_depth_by_hand():
@@ -38,29 +35,30 @@ def test_a_lead_pairs_contacts_and_is_in_points():
     assert (found.low, found.high) == (0, 100)
 
 
-@pytest.mark.parametrize("change", [{"labelled": (30, 10)}, {"labelled": ()}, {"tune_steps": (0, 5)}, {"seeds": 0}])
-def test_bad_settings_are_refused(change):
-    with pytest.raises(ValueError, match=next(iter(change))):
-        dataclasses.replace(StageOneConfig(), **change)
-
-
-@pytest.mark.slow
-def test_a_shrunken_run_writes_its_curves_and_encoders(tmp_path, cache_dir):
-    small = dataclasses.replace(
-        stage_one.SMOKE,
-        touch=dataclasses.replace(stage_one.SMOKE.touch, scenes=SCENES),
-        pretrain=dataclasses.replace(
-            stage_one.SMOKE.pretrain,
-            encoder=dataclasses.replace(MODEL.tactile, causal=True),
-            frames=MODEL.frames,
-            image_px=MODEL.image_px,
-            steps=1,
-            probe_every=1,
-        ),
-        labelled=(3, 5),
-    )
-    run = run_shrunk(stage_one, small, tmp_path, "--cache-dir", str(cache_dir))
-    assert {path.stem for path in (run / "encoders").iterdir()} == {
-        f"{method}-{seed}" for method in ("contrast", "physics") for seed in range(2)
+def test_failure_is_defined_at_the_end_and_alarms_during_training():
+    """Seed 0 falls and recovers, seed 1 falls for good and keeps a third of its spread."""
+    measured = {
+        "kept": np.array([[0.2, 0.3, 0.9], [0.9, 0.4, 0.3]]),  # a fresh encoder raises no alarm
+        "rank_share": np.full((2, 3), 0.5),
+        "skill": np.full((2, 3), 0.3),
     }
-    assert (run / "results.json").exists()
+    outcome = CollapseOutcome(arm=ARMS[0], measured=measured, kept=np.array([2.0, 0.3]), lead=np.array([-1.0, 0.0]))
+    np.testing.assert_array_equal(outcome.failed, [False, True])
+    np.testing.assert_array_equal(outcome.alarmed, [False, True])
+    assert outcome.first_alarm(1) == 2
+
+
+def test_mean_frames_are_means_of_what_was_recorded(data, context):
+    rows = data.parts["sft"][:3]
+    (clip,) = clip_batches(data.store, rows, data.clip, batch_size=3, seed=0, shuffle=False, repeat=False)
+    exists = clip["frame_mask"][..., None, None, None]
+    assert not exists.all()  # some frames are padding of zeros
+    known = np.ma.masked_array(clip["frames"] / 255.0, ~np.broadcast_to(exists, clip["frames"].shape))
+    np.testing.assert_allclose(mean_frames(data, rows, context), known.mean(0).filled(0.0), atol=1e-6)
+
+
+def test_scores_leave_out_what_is_missing():
+    values = np.array([[[1.0, np.nan, 7.0]], [[3.0, 5.0, 9.0]]])
+    scores = FrameScores(values={"l1": values}, skips=np.array([3, 3, 5]))
+    np.testing.assert_array_equal(scores.mean("l1", 3, 1), [1, 4])
+    np.testing.assert_array_equal(scores.mean("l1", 3, 0), [3])

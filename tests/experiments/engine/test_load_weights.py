@@ -9,9 +9,8 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.engine import load_weights
-from experiments.engine.load_checkpoints import READERS, SHAPES, measure, random_checkpoint, shards
+from experiments.engine.load_checkpoints import READERS, SHAPES, measure, random_checkpoint
 from tests.experiments.shrunk import run_shrunk
-from touchr1_jax.models.load import peak_memory
 
 TINY = SHAPES["tiny"]
 
@@ -52,16 +51,6 @@ def test_readers_read_the_same_small_numbers(checkpoint):
     assert 2**-7 <= sizes.min() <= sizes.max() < 2**-6
 
 
-def test_only_single_tensors_exceed_a_shard():
-    for shard in shards(TINY, 20_000):
-        assert len(shard) == 1 or 2 * sum(int(np.prod(s)) for s in shard.values()) <= 20_000
-
-
-def test_a_reader_that_fails_names_the_fix(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no weights; correct the directory"):
-        measure(READERS["streamed"], tmp_path, TINY, silent)
-
-
 def end_at_once(*_: object) -> list[jax.Array]:
     os._exit(9)
 
@@ -69,19 +58,6 @@ def end_at_once(*_: object) -> list[jax.Array]:
 def test_a_reader_that_is_stopped_is_named(tmp_path):
     with pytest.raises(RuntimeError, match="ended without an answer: probably too little memory"):
         measure(end_at_once, tmp_path, TINY, silent)
-
-
-@pytest.mark.parametrize("reader", READERS)
-def test_the_process_that_reads_reports_its_progress_and_its_own_memory(checkpoint, reader):
-    """This process has imported more than the reader will, and has held what its child has not."""
-    folder, size, _ = checkpoint
-    held = np.ones(max(0, 2 * 10**8 - peak_memory()) // 8 + 10**6)
-    progress: list[tuple[int, int]] = []
-    assert measure(READERS[reader], folder, TINY, lambda *word: progress.append(word)).before < peak_memory()
-    assert progress == sorted(progress)
-    assert progress[-1] == (size, size)
-    assert len(progress) > 3
-    assert peak_memory() >= held.nbytes
 
 
 def test_sizes_must_have_shapes_and_room(tmp_path):

@@ -32,19 +32,6 @@ def test_products_are_counted_through_loops():
     assert flops == {3: 2 * 2 * 4 * 4, 7: 2 * 5 * 2 * 4 * 3}
 
 
-@pytest.mark.parametrize(
-    ("left", "right", "axes", "name"),
-    [
-        ((2, 3, 4), (4, 5), (((2,), (0,)), ((), ())), "6 × 4 · 4 × 5"),
-        ((8, 6, 4), (8, 9, 4), (((2,), (2,)), ((0,), (0,))), "8 × (6 × 4 · 4 × 9)"),
-    ],
-)
-def test_a_product_is_named_by_its_sizes(left, right, axes, name):
-    traced = jax.make_jaxpr(lambda a, b: jax.lax.dot_general(a, b, axes))(jnp.ones(left), jnp.ones(right))
-    (product,) = products(traced.jaxpr, loops=1)
-    assert product.name == name
-
-
 def test_the_work_of_the_job_grows_with_the_prefix_as_it_must():
     """What the job multiplies grows with the prefix by what it needs for each prompt token, but for the last layer.
 

@@ -81,9 +81,3 @@ def test_a_full_run_is_preferred_to_a_newer_smoke_run(tmp_path):
     finished(tmp_path, "20260102-000000", TABLE["rows"], scale="smoke")
     assert newest_run(tmp_path / "pareto_contact").directory.name == "20260101-000000"
     assert judge(DEFAULTS[1], newest_run(tmp_path / "pareto_contact")) == []
-
-
-def test_without_runs_there_is_nothing_to_require(tmp_path):
-    results = read_json(run_shrunk(pareto, GatherConfig(), tmp_path) / "results.json")
-    assert len(results["settings"]["not run yet"].split(", ")) == 16
-    assert results["requirements"] == []

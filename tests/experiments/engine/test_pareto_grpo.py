@@ -3,11 +3,8 @@
 import numpy as np
 import pytest
 
-from experiments.core.artifacts import read_json
-from experiments.engine import pareto_grpo
 from experiments.engine.grpo_options import OptionRun, gain, option_table, option_verdict
-from experiments.engine.pareto_grpo import SMOKE, LearningCurves, ParetoGrpoConfig, cost_table
-from tests.experiments.shrunk import run_shrunk
+from experiments.engine.pareto_grpo import LearningCurves, cost_table
 
 
 def curves(*rewards: list[float], step_s: float = 1.0) -> LearningCurves:
@@ -37,11 +34,6 @@ def test_costs_by_hand():
     assert rows["c"][3:] == (None, None, "1 of 2")
 
 
-def test_groups_must_divide_the_rollouts():
-    with pytest.raises(ValueError, match=r"groups holds \[5\]: must divide rollouts = 32"):
-        ParetoGrpoConfig(groups=(4, 5))
-
-
 def run_of(accuracy: list[float], step_s: float) -> OptionRun:
     seeds = np.array(accuracy)
     return OptionRun(accuracy=seeds, entropy=seeds, kl=seeds, right=np.tile(seeds[:, None], (1, 3)), step_s=step_s)
@@ -64,19 +56,3 @@ def test_an_option_is_compared_seed_by_seed():
     (verdict,) = option_verdict(RUNS)
     assert "top-p .9" in verdict
     assert "max@2" not in verdict
-
-
-def test_unknown_options_are_named():
-    with pytest.raises(ValueError, match=r"options holds \['top-k'\]: must be of "):
-        ParetoGrpoConfig(options=("top-k",))
-
-
-@pytest.mark.slow
-def test_every_algorithm_and_option_has_a_row(tmp_path):
-    directory = run_shrunk(pareto_grpo, SMOKE, tmp_path)
-    results = read_json(directory / "results.json")
-    presets, options = ([row[0] for row in table["rows"]] for table in results["tables"])
-    assert presets == list(SMOKE.algorithms)
-    assert options == ["published", *SMOKE.options]
-    names = ("pareto_grpo", "courses", "options", "option_courses")
-    assert {p.name for p in (directory / "plots").iterdir()} == {f"{name}.svg" for name in names}

@@ -12,6 +12,7 @@ from experiments.engine.peers import JobSize, Peer, PeerFailed, PeerJob, format_
 JOB = PeerJob(prefix=5, rounds=2, size=JobSize(prompts=2, group=3, length=4, vocab_size=10))
 PRETENDER = """
 import sys
+from experiments.engine.harness_trl import settings
 from experiments.engine.peers import PeerJob, format_answer
 print("other output")
 print(format_answer(PeerJob.from_json(sys.argv[1]), [0.0, 3.0, 4.0, 6.0], {"pretender": "1.0"}))

@@ -65,10 +65,7 @@ def train(config: Config, context: Context, arm: str, seed: int) -> dict[str, Sc
     checkpoint = context.checkpoint_dir(stage) / "state.json"
     state = read_json(checkpoint) if checkpoint.exists() else {"step": 0, "value": 0.0}
     if not context.done(stage):
-        with (
-            context.timed(stage),
-            context.progress(stage, config.steps, completed=state["step"]) as advance,
-        ):
+        with context.timed(stage), context.progress(stage, config.steps, completed=state["step"]) as advance:
             for step in range(state["step"], config.steps):
                 if step == config.crash_at and os.environ.get("COIN_CRASHES"):
                     raise RuntimeError("the coin rolled away")

@@ -5,9 +5,9 @@ import pytest
 
 from experiments.fields.depth_checks import analytic_surfaces, scale_error
 from experiments.fields.depth_methods import INTEGRATORS, MAPS
-from experiments.fields.stressed_readings import depth_outcome, stressed_press
+from experiments.fields.stressed_readings import depth_outcome
 from sensors_io.calibration.circles import find_circles
-from sensors_io.calibration.generated_presses import AXIS_MM, WINDOW_MM, fitted_optics, generated_presses, near_lamps
+from sensors_io.calibration.generated_presses import AXIS_MM, fitted_optics, generated_presses, near_lamps
 from sensors_io.calibration.published import known_truth
 from sensors_io.schema import Flag
 
@@ -70,13 +70,6 @@ def test_truth_at_known_depth_is_the_indenter():
     flat, inside = known_truth("prism", 0.25, (320, 320))
     assert np.unique(flat).tolist() == [0.25]
     assert inside.sum() == 71 * 107
-
-
-def test_a_stressed_press_takes_its_level():
-    """Level 0 from the border puts the centre of the contact on the border."""
-    assert stressed_press("contact from the border, mm", 0.0, seed=3).touch[0] == WINDOW_MM / 2
-    assert stressed_press("exposure, up", 1.3, seed=3).gain == 1.3
-    assert stressed_press("contact, radii of a ball of 6.31 mm", 0.5, seed=3).touch[2] == 6.31 / 4
 
 
 def test_depth_is_wrong_from_a_fifth_of_the_press():

@@ -3,7 +3,6 @@
 import pytest
 
 from experiments.fields.sections import assemble
-from experiments.fields.stability_fields import FieldStabilityConfig
 from experiments.fields.stress import StressedField, StressOutcome, break_table, gathered, stress_section
 from sensors_io.schema import Flag
 
@@ -31,8 +30,3 @@ def test_the_package_must_not_break_silently(mild, silent):
 def test_a_method_breaks_first_at_its_lowest_broken_level():
     found = outcomes(this={1: [GOOD], 2: [FLAGGED]}, theirs={1: [SILENT, GOOD], 2: [SILENT, GOOD]})
     assert break_table(NOISE, found).rows == (("this", "2: marker_loss 1"), ("theirs", "1: silent 2"))
-
-
-def test_a_configuration_without_the_package_is_refused():
-    with pytest.raises(ValueError, match="must hold"):
-        FieldStabilityConfig(methods=("mean shift",))

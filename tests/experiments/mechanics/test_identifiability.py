@@ -1,57 +1,22 @@
 """The study of identifiability, shrunk: presses are the generator's own, probes are tested on unseen objects."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.core.artifacts import read_json
-from experiments.mechanics import (
-    identifiability,
-    identify_features,
-    identify_motions,
-    identify_presses,
-    identify_probes,
-)
-from experiments.mechanics.identify_features import in_threads
+from experiments.mechanics import identify_features, identify_motions, identify_presses, identify_probes
 from experiments.mechanics.identify_presses import ContactTier, press_features, press_setup, read_press
-from experiments.mechanics.identify_probes import SOURCES, STATIC
 from sensors_io.scenes import schedule, surface
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.press import make_kernels
-from sensors_io.scenes.sensors import MODELS, XENSE
+from sensors_io.scenes.sensors import MODELS
 from sensors_io.scenes.sequence import make_sequence
 from sensors_io.schema import SENSORS, Phase
-from tests.experiments.shrunk import run_shrunk
 from touchr1_jax.training.linear_probe import ProbeConfig, cross_fit
 
 SCENES = SceneConfig(objects=8, sites=1, frames=3, min_force_n=0.3, max_force_n=3.0, image_px=24, contact_grid=24)
-TINY = dataclasses.replace(
-    identifiability.SMOKE,
-    presses=SCENES,
-    exact_grid=32,
-    noise=(0.0, 1.0),
-    probe=ProbeConfig(folds=2, iterations=3),
-    batch=3,
-)
 PROBE = ProbeConfig(folds=4, iterations=20)
-
-
-@pytest.mark.slow  # compiles ten programs
-def test_a_shrunken_study_fills_every_table(tmp_path):
-    directory = run_shrunk(identifiability, TINY, tmp_path)
-    assert {p.name for p in (directory / "plots").iterdir()} == {"identifiability.svg", "label_transfer.svg"}
-    results = read_json(directory / "results.json")
-    touch, blind, tiers, moved = (table["rows"] for table in results["tables"])
-    assert [row[0] for row in touch] == [f"{name}, {source}" for name in STATIC for source in SOURCES]
-    assert [row[0] for row in blind] == list(STATIC)
-    assert [row[0] for row in tiers] == [f"{t}: {n}" for t in ("24²", "24², 0.01", "springs, 24²") for n in STATIC]
-    assert len(moved) == 6
-    for row in (*touch, *blind, *tiers, *moved):
-        assert np.all(np.abs(row[1:]) <= 100), row  # a percentage or a difference of two
-    assert len(results["requirements"]) == 3  # two tiers in use and the control
 
 
 def test_features_repeat_whatever_the_batch_and_grow_with_noise():
@@ -83,15 +48,6 @@ def test_a_press_is_the_generators_own(order):
         assert np.mean(off > 0) < 1e-3
 
 
-def test_noise_is_scaled_and_nothing_else():
-    louder = identify_presses.noisier(XENSE, 3.0)
-    assert (louder.depth_noise_mm, louder.lateral_noise_mm) == (3 * XENSE.depth_noise_mm, 3 * XENSE.lateral_noise_mm)
-    assert louder.shot_noise == tuple(3 * s for s in XENSE.shot_noise)
-    assert identify_presses.noisier(XENSE, 0.0).read_noise == (0, 0, 0)
-    noise = ("depth_noise_mm", "lateral_noise_mm", "read_noise", "shot_noise")
-    assert dataclasses.replace(louder, **{name: getattr(XENSE, name) for name in noise}) == XENSE
-
-
 def skin(radius_mm=(20.0, 40.0), wave_mm=1.5, amplitude_mm=0.0):
     """A paraboloid with one plane wave along x."""
     features = {"feature_height_mm": 0.0, "feature_pitch_mm": 3.0, "feature_width": 0.2}
@@ -118,14 +74,6 @@ def test_a_wave_lies_in_its_band(wave_mm, band):
     rms = found[2:9]
     assert rms[band] == pytest.approx(0.02 / np.sqrt(2) * 0.375, rel=0.05)  # Hann's mean square along each axis is 3/8
     assert np.delete(rms, band).max() < 0.1 * rms[band]
-
-
-def test_a_coarse_grid_leaves_out_short_waves():
-    fine, coarse = (
-        np.exp(identify_features.statistics(identify_presses.skins(dataclasses.replace(SCENES, contact_grid=n))))[:, 8]
-        for n in (64, 24)
-    )
-    assert np.median(coarse / fine) < 0.5
 
 
 @pytest.fixture(scope="module")
@@ -162,12 +110,6 @@ def test_a_probe_carries_over_what_its_records_taught(questions):
     assert exact.right.mean() < 0.2
 
 
-def test_folds_need_objects(questions):
-    features, labels, objects = questions
-    with pytest.raises(ValueError, match="objects has 2 members, fewer than folds = 4; lower folds"):
-        identify_probes.transfer(features, [], labels, objects % 2, PROBE)
-
-
 def test_fused_answers_multiply():
     labels = np.array([0, 1])
     first = np.log([[0.6, 0.3, 0.1], [0.4, 0.5, 0.1]])
@@ -179,12 +121,6 @@ def test_fused_answers_multiply():
     assert (two.far_off, both.far_off) == (50, 0)
 
 
-def test_points_are_clustered_by_object():
-    values = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
-    found = identify_probes.points(values, np.array([0, 0, 1, 1]))
-    assert (found.mean, found.low, found.high) == (25, 0, 50)
-
-
 def test_frames_of_a_motion_are_those_in_which_something_changes():
     a, load, hold, un = (p.value for p in (Phase.APPROACH, Phase.LOAD, Phase.HOLD, Phase.UNLOAD))
     phase = np.array([a, a, load, load, hold, hold, hold, un, un])
@@ -192,25 +128,3 @@ def test_frames_of_a_motion_are_those_in_which_something_changes():
     np.testing.assert_array_equal(identify_motions.choose_frames(phase, 5), [0, 2, 3, 7, 8])
     with pytest.raises(ValueError, match="moments is 6: only 5 frames differ"):
         identify_motions.choose_frames(phase, 6)
-
-
-def test_jobs_keep_their_order_and_their_errors():
-    done = []
-    assert in_threads(lambda x: x**2, range(5), lambda: done.append(1)) == [0, 1, 4, 9, 16]
-    assert len(done) == 5
-    with pytest.raises(ZeroDivisionError):
-        in_threads(lambda x: 1 / x, [1, 0], lambda: None)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"noise": (0.0, 2.0)}, "noise is"),
-        ({"presses": SceneConfig(objects=1, sequences=4)}, r"presses\.sequences is 4"),
-        ({"motions": SCENES}, r"motions\.sequences is None"),
-        ({"exact_grid": 64}, "exact_grid is 64"),
-    ],
-)
-def test_a_config_that_cannot_answer_is_refused(change, message):
-    with pytest.raises(ValueError, match=message):
-        dataclasses.replace(identifiability.DEFAULT, **change)

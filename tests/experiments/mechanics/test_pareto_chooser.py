@@ -1,37 +1,15 @@
 """The chooser's experiment, shrunk, and its arithmetic by hand."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
-from experiments.core.artifacts import jsonable, read_json
+from experiments.core.artifacts import jsonable
 from experiments.mechanics import chooser_measure as measured
 from experiments.mechanics import chooser_trial as trial
-from experiments.mechanics import pareto_chooser
 from experiments.mechanics.chooser_measure import FAMILIES, MenuMeasurements, draw
 from experiments.mechanics.chooser_trial import ChooserTrial, SequenceTrial
-from sensors_io.scenes import chooser_law
 from sensors_io.scenes.chooser_survey import FEATURES
 from sensors_io.scenes.sensors import XENSE
-from tests.experiments.shrunk import run_shrunk
-
-TINY = dataclasses.replace(pareto_chooser.SMOKE, batch=5, grids=(24,), asked=(0.9,), sequences=2)
-
-
-@pytest.mark.slow
-def test_a_shrunken_run_fills_every_table(tmp_path):
-    directory = run_shrunk(pareto_chooser, TINY, tmp_path)
-    results = read_json(directory / "results.json")
-    summary, families, generated, costs, law = (table["rows"] for table in results["tables"])
-    assert [row[0] for row in summary] == [row[0] for row in generated] == list(TINY.asked)
-    assert [row[0] for row in families] == list(FAMILIES)
-    assert sum(row[1] for row in families) == TINY.batch
-    assert len(costs) == len(chooser_law.PADDINGS)
-    assert len(law) == 2 * len(dataclasses.fields(chooser_law.Law))
-    assert len(results["requirements"]) == 3 * len(TINY.asked)
-    assert b"</svg>" in (directory / "plots" / "chooser.svg").read_bytes()
-
 
 # By hand -------------------------------------------------------------------------------------------------------------
 
@@ -71,11 +49,6 @@ def test_batches_survive_a_round_trip():
     np.testing.assert_array_equal(again.family, np.concatenate([made.family, made.family]))
     kept = SequenceTrial(asked=0.1, grid=np.array([64]), met=np.array([True]), error=np.ones((1, 2)))
     assert measured.join(SequenceTrial, [jsonable(kept), jsonable(kept)]).asked == 0.1
-
-
-def test_every_batch_has_a_seed_of_its_own():
-    seeds = {pareto_chooser.hash_seed(0, name, s, i) for name in ("a", "b") for s in range(4) for i in range(3)}
-    assert len(seeds) == 24
 
 
 def test_families_are_what_they_say():

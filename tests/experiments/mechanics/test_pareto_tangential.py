@@ -1,54 +1,22 @@
 """The friction experiment, shrunk; the methods that it compares; the loops of real presses that it reads."""
 
-import dataclasses
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.core.artifacts import read_json
 from experiments.core.errors import ResultsError
-from experiments.mechanics import pareto_tangential, tangential_checks, tangential_scenes
+from experiments.mechanics import tangential_checks, tangential_scenes
 from experiments.mechanics import tangential_methods as methods
 from experiments.mechanics.pareto_tangential import MethodErrors, at_equal_error, time_at
 from experiments.mechanics.tangential_checks import PromiseCheck
-from experiments.mechanics.tangential_methods import MAIN, METHODS, PLAIN, SOLVER
+from experiments.mechanics.tangential_methods import MAIN, PLAIN, SOLVER
 from sensors_io.scenes.sensors import XENSE
-from tests.experiments.shrunk import run_shrunk
-
-TINY = dataclasses.replace(
-    pareto_tangential.SMOKE, contacts=1, sensors=("xense",), grid=24, frames=20, rounds=1, closed_grid=32
-)
 
 
 @pytest.fixture(scope="module")
 def contacts():
     kernels = tangential_scenes.friction_kernels(XENSE, 24)
     return kernels, *tangential_scenes.sample(kernels, 1, 0, 0)
-
-
-@pytest.mark.slow
-def test_a_shrunken_run(tmp_path):
-    directory = run_shrunk(pareto_tangential, TINY, tmp_path)
-    results = read_json(directory / "results.json")
-    assert {p.name for p in (directory / "plots").iterdir()} == {"pareto_tangential.svg", "promise.svg"}
-    assert {"Cattaneo–Mindlin, slide off by", "Lubkin, torque off by"} <= {r["name"] for r in results["requirements"]}
-    by_task = [{row[0]: row[1:] for row in table["rows"]} for table in results["tables"][: len(METHODS)]]
-    for rows, compared in zip(by_task, METHODS.values(), strict=True):
-        assert list(rows) == list(compared)
-        assert np.all(np.isfinite(list(rows.values())))
-        worst = {name: row[3] for name, row in rows.items()}
-        assert worst[f"{SOLVER} 0.0003"] < worst[f"{SOLVER} 0.02"]
-        assert worst[MAIN] < 15  # per cent, on 24²
-    for rows in by_task[1:]:
-        median = {name: row[1] for name, row in rows.items()}
-        assert median[f"{PLAIN} 80"] < median[f"{PLAIN} 5"] < median["full slip"]
-    hold, slide, twist = results["tables"][7]["rows"]  # coupling
-    assert [row[0] for row in (hold, slide, twist)] == [f"{m}, xense" for m in tangential_checks.MOTIONS]
-    assert hold[5] is None
-    assert slide[5] > 0
-    assert 0 < hold[1] < 100
-    assert hold[4] < slide[4] + 20
 
 
 @pytest.mark.slow
@@ -91,11 +59,6 @@ def test_kinds_are_what_they_are_called():
     assert 0.01 <= rms <= 0.06
     assert not np.any(patterned.wave_amplitudes_mm)
     assert patterned.feature_height_mm >= 0.05
-
-
-def test_unknown_sensors_are_refused():
-    with pytest.raises(ValueError, match="must be some of gelsight_mini"):
-        tangential_scenes.sensors(("xense", "finger"))
 
 
 def _rows(**ladders):

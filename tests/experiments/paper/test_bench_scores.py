@@ -108,13 +108,6 @@ def test_the_interval_of_the_average_resamples_whole_objects():
     assert found.ci95[1] - found.ci95[0] > 1
 
 
-def test_conflict_needs_the_answers_from_pictures():
-    asks = (*everything(), ask("conflict", (2,), touches=(2,), deceptive=True), ask("conflict", (0,), touches=(3,)))
-    right, wrong = (answer_all(asks, constant(level), PLACES, SENSORS) for level in (2, 1))
-    assert "conflict_acc" not in bench_row(asks, [right])
-    assert bench_row(asks, [right], [wrong])["conflict_acc"].mean == 50
-
-
 def row(**seeds: tuple[float, ...]) -> dict[str, Estimate]:
     return {m: Estimate(mean=sum(x) / len(x), ci95=(0.0, 0.0), per_seed=x) for m, x in seeds.items()}
 
@@ -134,10 +127,8 @@ def test_pooled_columns_are_shares_and_errors_count_the_other_way():
     assert pooled_table({"sft": rows["constant"]}, "sft") == ()
 
 
-@pytest.mark.parametrize(
-    ("metric", "sft", "full", "better"),
-    [("h_acc", (50.0, 51.0), (70.0, 71.0), "1.00"), ("omae", (0.5, 0.6), (0.7, 0.8), "0.00")],
-)
-def test_a_better_row_is_better(metric, sft, full, better):
-    (table,) = pooled_table({"sft": row(**{metric: sft}), "full": row(**{metric: full})}, "sft")
-    assert table.rows[1][3:] == (better, f"[{better}, {better}]")
+def test_conflict_needs_the_answers_from_pictures():
+    asks = (*everything(), ask("conflict", (2,), touches=(2,), deceptive=True), ask("conflict", (0,), touches=(3,)))
+    right, wrong = (answer_all(asks, constant(level), PLACES, SENSORS) for level in (2, 1))
+    assert "conflict_acc" not in bench_row(asks, [right])
+    assert bench_row(asks, [right], [wrong])["conflict_acc"].mean == 50

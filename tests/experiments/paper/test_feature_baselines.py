@@ -13,13 +13,11 @@ from experiments.paper.feature_baselines import (
     LabelledFeatures,
     field_features,
     linear_probe,
-    mean_tokens,
     nearest,
     other_objects,
     picture_features,
     together_and_alone,
 )
-from tests.experiments import tiny
 from touchr1_jax.training.linear_probe import ProbeConfig
 
 LEVELS = (3,)
@@ -70,13 +68,6 @@ def test_streams_that_are_not_shared_do_not_count():
     assert found.alone[:, :, 0].tolist() == [[0, 1], [-1, -1]]
 
 
-def test_unannotated_contacts_do_not_vote():
-    known = LabelledFeatures(features=features([[[0.0]], [[1.0]]]), label=np.array([[-1], [2]]))
-    assert predict(known, features([[[0.0]]]), (3,)).together[0, 0] == 2
-    with pytest.raises(ValueError, match=r"label\[:, 0\] is −1 throughout"):
-        predict(LabelledFeatures(features=known.features, label=np.full((2, 1), -1)), features([[[0.0]]]), (3,))
-
-
 def test_a_probe_reads_a_stream_and_gives_bottom_where_it_is_absent():
     known, asked = two_streams(noise=0.05), two_streams(noise=0.05, seed=1)
     single = dataclasses.replace(known, features=known.features.only(0))
@@ -121,14 +112,3 @@ def test_pictures_give_colour_and_texture():
     assert colour[0].reshape(CELLS, CELLS, 3).mean((0, 1)) == pytest.approx(view.mean((0, 1)) / 255, abs=1e-3)
     assert np.ptp(texture[1]) == 0
     assert texture[0].min() > texture[1].max()
-
-
-def test_absent_tokens_do_not_count():
-    encoded = tiny.features(3)
-    time = encoded.touch_time.copy()
-    time[0, 0, 1:] = -1
-    present = encoded.stream_mask & (np.arange(3) != 2)[:, None]
-    found = mean_tokens(dataclasses.replace(encoded, touch_time=time, stream_mask=present))
-    assert np.allclose(found.x[0, 0], encoded.touch[0, 0, 0], atol=1e-6)
-    assert np.allclose(found.x[1, 2], encoded.touch[1, 2].mean(0), atol=1e-6)
-    assert found.present.tolist() == [[True] * 4, [True] * 4, [False] * 4]

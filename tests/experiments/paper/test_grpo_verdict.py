@@ -1,19 +1,14 @@
-"""The verdict on reinforcement: its arms, when a difference counts, and shrunken runs of it and of few labels."""
-
-import dataclasses
-import json
+"""Verdicts on reinforcement, on the lengths of SFT and on sizes, by hand values."""
 
 import numpy as np
 import pytest
 
-from experiments.core.results import Comparison
-from experiments.paper import few_labels, grpo_verdict
-from experiments.paper.grpo_verdict import GrpoVerdictConfig, algorithm_of, sure
-from experiments.paper.label_curves import METHODS, compared_pairs
+from experiments.core.results import Comparison, Estimate
+from experiments.paper.grpo_verdict import algorithm_of, sure
 from experiments.paper.label_curves import verdict as curves_verdict
-from experiments.study.study import StudyConfig
+from experiments.paper.model_sizes import SizeCost, grpo_step_s, size_trends
+from experiments.paper.pareto_sft import PhaseResult, efficient
 from tests.experiments import tiny
-from tests.experiments.shrunk import run_shrunk
 from touchr1_jax.rl.config import Norm
 
 
@@ -54,18 +49,6 @@ def test_an_enumerated_preset_keeps_its_norm_and_draws_no_prompt_twice():
     assert algorithm_of("rloo", exact=False).enumerated is None
 
 
-@pytest.mark.parametrize("change", [{"steps": (1,)}, {"lr_scales": ()}, {"presets": ()}])
-def test_bad_settings_of_the_verdict_are_refused(change):
-    with pytest.raises(ValueError, match=next(iter(change))):
-        GrpoVerdictConfig(**change)
-
-
-@pytest.mark.parametrize("change", [{"labelled": (30, 10)}, {"labelled": (2, 10)}, {"unlabelled": 0}])
-def test_bad_settings_of_few_labels_are_refused(change):
-    with pytest.raises(ValueError, match=next(iter(change))):
-        few_labels.FewLabelsConfig(**change)
-
-
 def test_the_verdict_of_few_labels_names_where_a_step_pays_and_where_it_costs():
     pays = difference(2, 4, "objects", arm="grpo-10-random", against="two_phases-10-random")
     costs = difference(-4, -2, "objects", arm="two_phases-30-pretrained", against="two_phases-30-random")
@@ -74,44 +57,51 @@ def test_the_verdict_of_few_labels_names_where_a_step_pays_and_where_it_costs():
     assert any(s.startswith("Stage 1") and "lowers it at 30 labels -3.0" in s for s in sentences)
 
 
-def test_every_method_is_compared_with_the_one_that_it_starts_from():
-    pairs = compared_pairs(10)
-    assert ("physics-10-random", "two_phases-10-random") in pairs
-    assert ("two_phases-10-pretrained", "two_phases-10-random") in pairs
-    assert len(pairs) == 2 * (len(METHODS) - 1) + 2
+def result(seconds: float, accuracy: float) -> PhaseResult:
+    return PhaseResult(seconds=seconds, accuracy=accuracy, material=30.0, omae=0.5)
 
 
-SHARED = {field.name: getattr(tiny.STUDY, field.name) for field in dataclasses.fields(StudyConfig)}
+def test_combinations_that_none_beats_by_hand():
+    found = {(1, 0): result(10, 50), (1, 9): result(30, 60), (2, 0): result(20, 49), (2, 9): result(40, 60)}
+    assert efficient(found) == [(1, 0), (1, 9)]
 
 
-@pytest.mark.slow
-def test_a_shrunken_verdict_scores_every_arm_on_objects_of_another_seed(tmp_path, cache_dir):
-    changes = SHARED | {"grpo": grpo_verdict.SMOKE.grpo, "fresh": dataclasses.replace(tiny.STUDY.scenes, seed=9)}
-    small = dataclasses.replace(grpo_verdict.SMOKE, **changes)
-    run = run_shrunk(grpo_verdict, small, tmp_path, "--cache-dir", str(cache_dir))
-    results = json.loads((run / "results.json").read_text())
-    arms = {f"{kind}-rloo-{prompts}" for kind in ("sampled", "enumerated") for prompts in (2, 4)}
-    assert set(results["arms"]) == {"sft", "sft_continued", *arms}
-    assert {c["against"] for c in results["comparisons"]} == {"sft_continued"}
+COSTS = {
+    name: SizeCost(parameters=n, sft_s=0.1, grpo_s=0.2, question_s=0.01)
+    for name, n in (("small", 100), ("default", 200), ("large", 400))
+}
 
 
-@pytest.mark.slow
-def test_shrunken_learning_curves_hold_every_method_and_encoder(tmp_path, cache_dir):
-    kept = few_labels.SMOKE
-    small = dataclasses.replace(
-        kept,
-        **(SHARED | {"grpo": kept.grpo, "grpo_steps": 1}),
-        labelled=(4, 6),
-        unlabelled=3,
-        pretrain=dataclasses.replace(
-            kept.pretrain,
-            encoder=dataclasses.replace(tiny.STUDY.model.tactile, causal=True),
-            frames=tiny.STUDY.model.frames,
-            image_px=tiny.STUDY.model.image_px,
-        ),
-    )
-    run = run_shrunk(few_labels, small, tmp_path, "--cache-dir", str(cache_dir))
-    results = json.loads((run / "results.json").read_text())
-    expected = {f"{m}-{n}-{e}" for m in METHODS for n in (4, 6) for e in ("random", "pretrained")}
-    assert set(results["arms"]) == expected
-    assert all(np.isfinite(row["acc"]["mean"]) for row in results["arms"].values())
+def estimate(*per_seed: float) -> Estimate:
+    mean = float(np.mean(per_seed))
+    return Estimate(mean=mean, ci95=(mean - 1, mean + 1), per_seed=per_seed)
+
+
+def rows(metric: str, *values: tuple[float, ...]) -> dict:
+    return {"full model": {name: {metric: estimate(*v)} for name, v in zip(COSTS, values, strict=True)}}
+
+
+def test_a_straight_line_has_its_slope_in_every_seed():
+    (found,) = size_trends(rows("acc", (50.0, 60.0), (53.0, 63.0), (56.0, 66.0)), COSTS, ("acc",))
+    assert (found.slope.mean, found.slope.low, found.slope.high) == pytest.approx((3, 3, 3))
+
+
+@pytest.mark.parametrize(
+    ("metric", "values", "larger_is"),
+    [
+        ("acc", ((50.0, 60.0), (53.0, 63.0), (56.0, 66.0)), "better"),
+        ("omae", ((0.9, 0.8), (0.8, 0.7), (0.7, 0.6)), "better"),
+        ("acc", ((50.0, 60.0), (53.0, 55.0), (56.0, 51.0)), "undecided"),
+        ("acc", ((60.0, 60.0), (55.0, 55.1), (50.0, 50.0)), "worse"),
+    ],
+)
+def test_less_error_is_better_and_scatter_is_undecided(metric, values, larger_is):
+    (found,) = size_trends(rows(metric, *values), COSTS, (metric,))
+    assert found.larger_is == larger_is
+
+
+def test_seconds_of_steps():
+    timing = {"in steps/grpo/full/0": 3.0, "in steps/grpo/full/1": 5.0, "in steps/sft/0": 9.0, "grpo/full/0": 7.0}
+    config = tiny.STUDY
+    assert grpo_step_s(config, timing) == pytest.approx(8 / (2 * (config.grpo_steps - 1)))
+    assert COSTS["small"].training_s(config) == pytest.approx(0.1 * config.sft.steps + 0.2 * config.grpo_steps)

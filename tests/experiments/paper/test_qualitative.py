@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from experiments.paper.qualitative import Conclusions, answer_cases, first_of, item_examples
+from experiments.paper.qualitative import Conclusions, answer_cases, item_examples
 from experiments.paper.touch_gain import TouchQuestions
 from touchr1_jax.bench.items import Ask, Touch
 from touchr1_jax.training.evaluation import Evaluation
@@ -26,17 +26,6 @@ def test_every_answer_is_of_its_cases():
     cases = answer_cases(QUESTIONS, CONCLUSIONS)
     assert [np.flatnonzero(c.rows).tolist() for c in cases] == [[0], [3], [2], [1], [0, 2], [], [1], [0], [1, 4], [4]]
     assert [c.share for c in cases[:4]] == [50, 100, 50, 100 / 3]
-
-
-def test_a_case_without_questions_has_no_share():
-    honest = TouchQuestions(**{**vars(QUESTIONS), "looks_like_another": np.zeros(5, bool)})
-    assert answer_cases(honest, CONCLUSIONS)[1].share == 0
-
-
-def test_the_first_answer_of_each_object_is_shown():
-    rows = np.array([False, True, True, True, True])
-    assert first_of(rows, QUESTIONS.objects, 2) == [1, 3]
-    assert first_of(np.zeros(5, bool), QUESTIONS.objects, 2) == []
 
 
 def test_an_item_is_shown_by_the_answers_that_it_consists_of():

@@ -7,7 +7,6 @@ import pytest
 
 from experiments.recordings.cross_validation import agreement, constants, deal_folds, objects_for, scores, vote
 from touchr1_jax.models.description_policy import COMBINATIONS, choose, utility
-from touchr1_jax.training.kernel_probe import object_weights
 
 OBJECTS = np.repeat([f"o{i}" for i in range(12)], 3)
 LABEL = np.repeat(np.array([[i % 3, (i // 3) % 3, 1] for i in range(12)]), 3, axis=0)
@@ -22,11 +21,6 @@ def test_an_object_is_in_one_fold_whatever_the_order():
     assert (deal_folds(OBJECTS, LABEL, 4, 1) != fold).any()
     with pytest.raises(ValueError, match="folds is 13"):
         deal_folds(OBJECTS, LABEL, 13, 0)
-
-
-def test_every_object_weighs_the_same():
-    objects = np.array(["a", "a", "b", "c"])
-    assert object_weights(objects, np.array([True, True, True, False])).tolist() == [0.5, 0.5, 1.0, 0.0]
 
 
 def test_scores_by_hand():

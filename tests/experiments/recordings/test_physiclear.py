@@ -1,5 +1,6 @@
 """The study of real videos on a folder of synthetic presses, and answers for a folder that it never saw."""
 
+import dataclasses
 import json
 import shutil
 
@@ -7,7 +8,9 @@ import cv2
 import pytest
 
 from experiments.core.artifacts import read_json
-from experiments.core.runner import main
+from experiments.core.runner import main, run_experiment
+from experiments.recordings import physiclear
+from tests.experiments import tiny
 from tests.experiments.recordings.presses import press
 from tests.experiments.shrunk import only_run
 from tests.sensors_io.importers.films import entry, labels
@@ -32,13 +35,21 @@ def source(path):
     return path
 
 
+SMOKE = dataclasses.replace(physiclear.SMOKE, scenes=tiny.SCENES)  # which the session has made
+SMALL = dataclasses.replace(physiclear.EXPERIMENT, scales={"smoke": SMOKE})
+
+
+def run_small(*arguments: str) -> int:
+    return run_experiment(SMALL, ["--scale", "smoke", *arguments], "")
+
+
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def run(tmp_path_factory, cache_dir):
     """A finished run, its folder of videos and its cache."""
     home = tmp_path_factory.mktemp("physiclear")
     data = source(home / "in")
-    places = ["--runs-dir", str(home / "runs"), "--cache-dir", str(home / "cache")]
-    assert main(["physiclear", "--scale", "smoke", "--data-dir", str(data), "--objects", "6", *places]) == 0
+    places = ["--runs-dir", str(home / "runs"), "--cache-dir", str(cache_dir)]
+    assert run_small("--data-dir", str(data), "--objects", "6", *places) == 0
     return home, data, only_run(home / "runs", "physiclear"), places
 
 
@@ -61,7 +72,7 @@ def test_a_kept_policy_answers_for_a_folder(run):
     (unseen / "broken.mov").write_bytes(b"no video")
     out, policy = home / "pred.json", str(directory / "policy.npz")
     asked = ["--predict", str(unseen), "--out", str(out), "--policy", policy]
-    assert main(["physiclear", "--scale", "smoke", *asked, *places]) == 0
+    assert run_small(*asked, *places) == 0
     answers = json.loads(out.read_text())
     assert {name: set(levels) for name, levels in answers.items()} == {"new.avi": {"hardness", "roughness", "bumps"}}
     assert set(answers["new.avi"].values()) <= {0, 1, 2}

@@ -106,12 +106,3 @@ def test_force_predicts_hardness_when_frames_are_dropped_and_not_when_matched(ch
     assert rigid["hardness"] < 45
     assert best(matched) < 45
     assert matched["median peak"] <= rigid["median peak"]
-
-
-def test_left_out_frames_are_counted_by_material_and_force(cheap):
-    table = throughput_scenes.left_out_table(SceneConfig(objects=40, sequences=4 * 80, frames=40, seed=18))
-    *materials, every = table.rows
-    assert every[0] == "all"
-    for column in range(1, len(every)):
-        assert sum(row[column] for row in materials) == every[column]
-    assert every[2] == sum(every[4:])

@@ -77,14 +77,6 @@ def test_padding_the_last_block_changes_nothing(policy, ask):
     assert len(np.unique(padded.tokens, axis=0)) > 1, "a policy that says one thing tests nothing"
 
 
-def test_sampled_answers_differ_from_each_other_and_repeat(ask):
-    features = tiny.features(3)
-    one, again = (ask(features, LABEL, alone=False, samples=3) for _ in range(2))
-    assert one.sampled.shape == (12, 3, 4)
-    assert np.array_equal(one.sampled, again.sampled)
-    assert np.array_equal(one.tokens, ask(features, LABEL, alone=False).tokens)
-
-
 def test_the_marginal_is_the_mean_over_traces_of_the_levels_that_may_follow(policy, params):
     """As the learner's forward pass scores them; under the grammar every trace concludes."""
     contact, attribute = np.divmod(np.arange(8), 4)
@@ -143,8 +135,3 @@ def test_every_labelled_question_is_asked_with_all_streams_and_each_alone(policy
     assert said.parsed.conclude[:, 0].tolist() == [15] * 3 + [5] * 4
     assert said.alone[:, :, 0].tolist() == [[1, 2, 4, 8]] * 3 + [[1, 0, 4, 0]] * 4
     assert (done[0], done[-1]) == ((0, 35), (35, 35))  # seven questions, by all streams and each of four
-
-
-def test_a_policy_that_feels_nothing_is_not_asked_stream_by_stream(policy):
-    features = dataclasses.replace(tiny.features(1), stream_mask=np.zeros((1, 4), bool))
-    assert evaluate_policy(policy, {"decoder": {}}, features, LABEL[:1], answer=felt_sum).alone is None

@@ -3,8 +3,6 @@
 import ast
 import dataclasses
 import io
-import json
-import shutil
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +14,6 @@ from experiments.core.context import Context
 from experiments.core.runs import ROOT
 from experiments.study.cache import LATER, NEVER, USED, fingerprint, source_digest
 from experiments.study.stages import EncodedContacts, StudySFT, make_arm, run_grpo, run_sft
-from sensors_io.records import RecordStore
 from tests.experiments import tiny
 from touchr1_jax.training.loop import LoopConfig
 
@@ -74,14 +71,6 @@ def test_a_damaged_file_of_the_cache_is_made_again(sft, first, home):
     assert sft("found again")[0].keys() == params.keys()
 
 
-def test_a_resumed_run_keeps_the_order_of_its_log(sft, first, home):
-    log = home / "first" / "metrics.jsonl"
-    before = log.read_bytes() + b'{"stage": "grpo/a/0", "step": 0}\n'
-    log.write_bytes(before)
-    sft("first")
-    assert log.read_bytes() == before
-
-
 @pytest.mark.parametrize(("steps", "seed"), [(0, 0), (2, 1)])
 def test_another_setting_is_another_checkpoint(sft, first, steps, seed):
     before = sft("second")[1]
@@ -124,18 +113,6 @@ def test_an_arm_that_differs_in_anything_is_trained(grpo, other, trained):
     assert len(after - before) == trained
     changed = not jax.tree.all(jax.tree.map(np.array_equal, params["decoder"], found["decoder"]))
     assert changed == ("steps" in other)
-
-
-def test_other_records_are_another_checkpoint(data, tmp_path):
-    """The same touch may come with other pictures: the index knows, by its configuration and its shards' sizes."""
-    shutil.copytree(data.store.path, tmp_path / "other")
-    index = tmp_path / "other" / "index.json"
-    assert RecordStore(tmp_path / "other").digest == data.store.digest
-    tree = json.loads(index.read_text())
-    tree["meta"]["config_hash"] += "0"
-    del tree["crc32"]
-    index.write_text(json.dumps(tree))
-    assert RecordStore(tmp_path / "other").digest != data.store.digest
 
 
 def test_every_value_and_number_counts_and_how_programs_are_compiled():

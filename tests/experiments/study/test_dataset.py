@@ -82,12 +82,3 @@ def test_records_are_opened_with_their_own_sensors_labels_and_forces(tmp_path):
             writer.write_object(fakes.card(n))
             writer.write_contact([fakes.sequence(n, force_n=None)])
     assert not open_dataset(tmp_path / "bare", ClipConfig(), 0.5).has_force
-
-
-def test_the_summary_counts_contacts_and_objects(data):
-    summary = data.summary()
-    assert summary["sft_contacts"] + summary["grpo_contacts"] == 10
-    assert (summary["val_objects"], summary["test_objects"]) == (1, 5)
-    assert (summary["source"], summary["sensors"]) == ("generated", list(SENSORS))
-    lies = [data.store.objects[data.object_ids[i]].visual_lies for i in data.parts["test"]]
-    assert summary["test_visual_lie_share"] == pytest.approx(sum(lies) / len(lies))

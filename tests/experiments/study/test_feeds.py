@@ -4,12 +4,11 @@ import dataclasses
 import itertools
 import json
 import threading
+from functools import partial
 
 import jax
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from experiments.study.stages import StudySFT, answer_feed
 from sensors_io.augment import AugmentConfig
@@ -17,9 +16,9 @@ from sensors_io.pipeline import clip_batches
 from sensors_io.schema import LEVELS
 from tests.experiments import tiny
 from touchr1_jax.text.oracle import read
-from touchr1_jax.training.feeds import AnswerFeed, encoded_clips, falling_share, random_streams, take
+from touchr1_jax.training.feeds import AnswerFeed, encoded_clips, falling_share, random_streams
 from touchr1_jax.training.packing import Packing
-from touchr1_jax.training.questions import QuestionFeed, equal_blocks, question_batch
+from touchr1_jax.training.questions import QuestionFeed, equal_blocks
 
 
 @pytest.fixture(scope="module")
@@ -63,16 +62,8 @@ def encoded(policy, data, evidence):
     return feed
 
 
-@pytest.fixture
-def packed(answers):
-    """Every contact by itself, so that whoever reads some contacts packs those alone."""
-    return lambda **changes: answers(packing=Packing(width=128, contacts=1), **changes)
-
-
-@pytest.fixture
-def easy(answers):
-    """All sensors first, for longer than a test looks."""
-    return lambda **changes: answers(easy_steps=10, **changes)
+PACKED = {"packing": Packing(width=128, contacts=1)}
+"""Every contact by itself, so that whoever reads some contacts packs those alone."""
 
 
 @pytest.fixture(scope="module")
@@ -84,6 +75,11 @@ def features(data):
 def questions(policy, data, features):
     label = data.label[data.parts["grpo"]]
     return lambda **changes: QuestionFeed(policy, features, label, **{"batch_size": 4, "seed": 1, **changes})
+
+
+@pytest.fixture
+def feeds(answers, encoded, questions):
+    return {"answers": answers, "encoded": encoded, "questions": questions, "packed": partial(answers, **PACKED)}
 
 
 def attribute_of(policy, ids: np.ndarray) -> int:
@@ -188,14 +184,6 @@ def test_encoded_contacts_come_with_their_own_features_and_answers(policy, data,
         assert said.compare[a] == evidence[contacts[i]][streams, a].sum(0).argmax()
 
 
-def test_packed_rows_need_clips(policy, data, evidence):
-    rows = data.parts["sft"]
-    clips = encoded_clips(tiny.features(len(rows)), rows, data.label[rows], batch_size=3, seed=1)
-    packing = Packing(width=128, contacts=1)
-    with pytest.raises(ValueError, match="packing is set"):
-        next(AnswerFeed(policy, clips, evidence, batch_size=3, questions=3, seed=1, packing=packing))
-
-
 def test_a_question_of_grpo_comes_with_its_verified_answer(policy, questions, data, evidence):
     contact = data.parts["grpo"]
     for batch in itertools.islice(questions(evidence=evidence[contact]), 3):
@@ -207,18 +195,21 @@ def test_a_question_of_grpo_comes_with_its_verified_answer(policy, questions, da
     assert next(questions()).answer is None
 
 
-@pytest.mark.parametrize("kind", ["answers", "questions"])
-def test_one_seed_is_one_sequence_of_batches(request, kind):
-    make = request.getfixturevalue(kind)
+KINDS = ["answers", "encoded", "questions", "packed"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_one_seed_is_one_sequence_of_batches(feeds, kind):
+    make = feeds[kind]
     first, again, other = ([leaves(next(feed)) for _ in range(3)] for feed in (make(), make(), make(seed=2)))
     assert equal(first, again)
     assert not equal(first, other)
     assert not equal(first[:1], first[1:2])
 
 
-@pytest.mark.parametrize("kind", ["answers", "encoded", "questions", "packed", "easy"])
-def test_a_state_resumes_exactly(request, kind):
-    make = request.getfixturevalue(kind)
+@pytest.mark.parametrize(("kind", "changes"), [*((kind, {}) for kind in KINDS), ("answers", {"easy_steps": 10})])
+def test_a_state_resumes_exactly(feeds, kind, changes):
+    make = partial(feeds[kind], **changes)
     feed = make()
     next(feed), next(feed)
     state = json.loads(json.dumps(feed.get_state()))
@@ -230,10 +221,10 @@ def test_a_state_resumes_exactly(request, kind):
     assert equal(rest[:1], [leaves(next(feed))])
 
 
-@pytest.mark.parametrize("kind", ["answers", "encoded", "questions", "packed"])
-def test_processes_that_share_batches_make_them_together(request, kind):
+@pytest.mark.parametrize("kind", KINDS)
+def test_processes_that_share_batches_make_them_together(feeds, kind):
     """What is drawn is drawn for the whole batch, so that it does not matter who makes which rows."""
-    make = request.getfixturevalue(kind)
+    make = feeds[kind]
     for own in (np.array([0, 2]), np.array([1])):
         part, whole = make(own=own), make()
         for _ in range(3):
@@ -264,21 +255,6 @@ def test_targets_hold_every_label_with_the_one_that_is_asked(policy, features, d
         np.testing.assert_array_equal(target.label, truth[contacts_of(features, batch)])
 
 
-def test_targets_describe_the_question(policy, questions, data):
-    label = data.label[data.parts["grpo"]]
-    for _, batch in zip(range(5), questions(), strict=False):
-        target = jax.tree.map(np.asarray, batch.target)
-        assert (target.asked.sum(1) == 1).all()
-        assert (target.label[target.asked] >= 0).all()
-        assert (target.levels == [3, 3, 3, 9]).all()
-        assert (target.ordinal == [True, True, True, False]).all()
-        for ids, mask, asked, row in zip(batch.ids, batch.mask, target.asked, target.label, strict=True):
-            a = attribute_of(policy, ids)
-            assert asked[a]
-            assert row[a] in label[:, a]
-            assert np.array_equal(mask, policy.layout.mask[a])
-
-
 def test_every_question_comes_once_an_epoch_and_none_without_a_label(policy, features, data):
     label = np.where(np.arange(4) == 3, -1, data.label[data.parts["grpo"]])
     total = int((label >= 0).sum())
@@ -286,29 +262,6 @@ def test_every_question_comes_once_an_epoch_and_none_without_a_label(policy, fea
     asked, contact = np.asarray(batch.target.asked).argmax(1), contacts_of(features, batch)
     assert sorted(zip(contact, asked, strict=True)) == list(zip(*np.nonzero(label >= 0), strict=True))
     np.testing.assert_array_equal(batch.target.label, label[contact])
-
-
-def test_a_question_is_felt_by_the_streams_that_it_says(policy, features, data):
-    label, rows, attribute = data.label[data.parts["grpo"]], np.array([2, 0]), np.array([1, 3])
-    streams = np.array([[True, False, False, True], [False, True, True, False]])
-    batch = question_batch(policy, features, label, rows, attribute, streams)
-    assert np.array_equal(batch.features.stream_mask, streams & features.stream_mask[rows])
-    assert np.array_equal(batch.target.streams, streams)
-    assert not batch.ordered.any()  # a press shows its peak in whatever order
-    assert np.array_equal(batch.features.touch, features.touch[rows])
-    assert np.array_equal(take(features, rows).view, features.view[rows])
-
-
-@given(
-    present=st.lists(st.lists(st.booleans(), min_size=4, max_size=4), min_size=1, max_size=8),
-    full_share=st.floats(0, 1),
-    seed=st.integers(0, 2**32 - 1),
-)
-def test_random_streams_are_some_of_the_present_ones(present, full_share, seed):
-    present = np.array(present)
-    streams = random_streams(present, full_share, np.random.default_rng(seed))
-    assert not (streams & ~present).any()
-    assert np.array_equal(streams.any(1), present.any(1))
 
 
 @pytest.mark.parametrize("full_share", [0.0, 0.5, 1.0])

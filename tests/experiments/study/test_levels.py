@@ -1,16 +1,14 @@
-"""Confusions, reliability and agreement by hand: questions not asked and answers not parsed count where they should."""
+"""Confusions, reliability, agreement and sampled answers by hand; pictures of fields."""
+
+import dataclasses
 
 import numpy as np
 import pytest
 
-from experiments.study.levels import (
-    LevelAnswers,
-    accuracy_by_agreement,
-    agreement_chart,
-    confusion_chart,
-    confusion_map,
-    reliability_table,
-)
+from experiments.study.examples import SCALE_PX, field_picture
+from experiments.study.levels import LevelAnswers, accuracy_by_agreement, confusion_map, reliability_table
+from experiments.study.sampled import sampled_table
+from tests.experiments.study.test_study import TEST, answers_about
 
 WORDS = {"hardness": ("soft", "hard")}
 ANSWERS = LevelAnswers(
@@ -50,9 +48,38 @@ def test_accuracy_by_agreement_by_hand():
         accuracy_by_agreement(LevelAnswers(answer=ANSWERS.answer, label=ANSWERS.label, objects=ANSWERS.objects))
 
 
-def test_charts_name_what_they_show():
-    confusions = confusion_chart({"sft": ANSWERS, "blind": ANSWERS}, WORDS)
-    assert confusions == confusion_chart({"sft": ANSWERS, "blind": ANSWERS}, WORDS)
-    read = LevelAnswers(answer=np.maximum(ANSWERS.answer, 0), label=ANSWERS.label, objects=ANSWERS.objects)
-    assert confusions != confusion_chart({"sft": read, "blind": read}, WORDS)
-    assert b"<svg" in agreement_chart({"sft": ANSWERS})
+SAMPLES = 4
+
+
+@pytest.fixture(scope="module")
+def seeds():
+    """Greedy answers are random; of two seeds the first samples the label always, the second half of the time."""
+    greedy = answers_about(TEST)
+    right = np.repeat(np.where(greedy.label >= 0, greedy.label, 0)[:, None], SAMPLES, 1)
+    wrong = (right + 1) * (np.arange(SAMPLES) % 2)[:, None] + right * (np.arange(SAMPLES) % 2 == 0)[:, None]
+    return [dataclasses.replace(greedy, sampled=sampled) for sampled in (right, wrong)]
+
+
+def test_scores_of_sampled_answers(seeds):
+    """Of the second seed's even votes the first sample, a right one, wins: .5 certain and always right."""
+    (row,) = sampled_table({"sft": seeds}, np.arange(len(TEST))).rows
+    name, _, once, several, majority, error = row
+    assert name == "sft"
+    assert [float(cell.split()[0]) for cell in (once, several, majority)] == [75.0, 100.0, 100.0]
+    assert error == pytest.approx(25.0)
+
+
+def test_fields_are_drawn_in_colour_with_arrows(data):
+    recorded = data.store.contact(int(data.parts["test"][0]))
+    picture = field_picture(recorded["tac3d"])
+    assert picture.shape == (192, 192 + SCALE_PX, 3)
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 20
+    still = dataclasses.replace(recorded["tac3d"], deformation_mm=np.zeros_like(recorded["tac3d"].deformation_mm))
+    assert not np.array_equal(field_picture(still), picture)
+    bare = dataclasses.replace(
+        recorded["tac3d"],
+        depth_mm=None,
+        deformation_mm=None,
+        frames=np.zeros((len(recorded["tac3d"]), 4, 4, 3), np.uint8),
+    )
+    assert field_picture(bare) is None

@@ -1,7 +1,6 @@
 """Where data comes from: refused combinations, caches named after what made them."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,19 +30,6 @@ def imported(monkeypatch):
 
     monkeypatch.setattr(sources, "import_physiclear", fake)
     return calls
-
-
-@pytest.mark.parametrize(
-    ("data", "folder", "message"),
-    [
-        ("generated", Path("x"), "data_dir is x: data 'generated' takes no data_dir: drop it"),
-        ("physiclear", None, "data_dir is None: data 'physiclear' needs data_dir"),
-        ("records", None, "data_dir is None: data 'records' needs data_dir"),
-    ],
-)
-def test_recordings_need_a_folder_and_scenes_have_none(data, folder, message):
-    with pytest.raises(ValueError, match=message):
-        SourceConfig(data=data, data_dir=folder)
 
 
 def test_records_are_taken_as_they_are(records, context):

@@ -5,11 +5,9 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from rich.console import Console
 
-from experiments.core.context import Context, read_metrics
 from experiments.study.scores import PUBLISHED
-from experiments.study.stages import ProbeFeatures, StudySFT, gather_evidence, make_arm, run_sft
+from experiments.study.stages import ProbeFeatures, StudySFT, answer_feed, gather_evidence, make_arm, run_sft
 from experiments.study.study import StudySeed, make_study_arm
 from sensors_io.schema import LEVELS
 from tests.experiments import tiny
@@ -21,7 +19,6 @@ from touchr1_jax.training.loop import Hooks, LoopConfig
 from touchr1_jax.training.train_sft import train_sft
 
 PROBE = ProbeConfig(folds=2, iterations=4)
-CONFIG = StudySFT(steps=3, batch_size=4)
 WIDTH = 128
 
 
@@ -59,45 +56,16 @@ def test_an_attribute_that_nobody_annotated_has_no_evidence(data, probed, contex
     assert (evidence[data.parts["sft"][1:], 0, 1, :3] != 0).all()
 
 
-@pytest.fixture(scope="module")
-def train(policy, data, tmp_path_factory):
-    """Parameters after SFT with some settings changed, on equal evidence for all levels, and its losses."""
-    evidence = np.zeros((len(data.store), len(data.clip.sensors), data.label.shape[1], 9), np.float32)
-
-    def run(**changes):
-        context = Context(tmp_path_factory.mktemp("run"), tmp_path_factory.mktemp("cache"), Console(quiet=True))
-        try:
-            config = dataclasses.replace(CONFIG, **changes)
-            params = run_sft(policy, data, evidence, config, context, seed=0, stage="sft/0")
-            return params, [line["loss"] for line in read_metrics(context.directory)]
-        finally:
-            context.close()
-
-    return run
+@pytest.fixture
+def evidence(data):
+    return np.zeros((len(data.store), len(data.clip.sensors), data.label.shape[1], 9), np.float32)
 
 
-@pytest.fixture(scope="module")
-def padded(train):
-    return train()
-
-
-def same(found, expected) -> None:
-    """Losses of all steps; Adam makes steps of the rounding of gradients that are zero, so parameters differ."""
-    assert len(expected) == CONFIG.steps
-    assert np.ptp(expected) > 1e-3
-    np.testing.assert_allclose(found, expected, rtol=1e-5)
-
-
-def test_rows_train_the_policy_that_padding_trains(train, padded):
-    found, losses = train(pack=WIDTH)
-    same(losses, padded[1])
-    assert jax.tree.structure(found) == jax.tree.structure(padded[0])
-
-
-def test_adapters_change_the_decoder_by_their_rank_and_train_the_rest(train, padded, policy, data):
-    found, _ = train(lora_rank=2)
-    assert jax.tree.structure(found) == jax.tree.structure(padded[0])
+def test_adapters_on_rows_change_the_decoder_by_their_rank_and_train_the_rest(policy, data, evidence, context):
+    config = StudySFT(steps=3, batch_size=4, lora_rank=2, pack=WIDTH)
+    found = run_sft(policy, data, evidence, config, context, seed=0, stage="sft/0")
     first = policy.init(0, tiny.one_batch(data))
+    assert jax.tree.structure(found) == jax.tree.structure(first)
     before, after = first["decoder"], found["decoder"]
     np.testing.assert_array_equal(after["embedding"]["embedding"], before["embedding"]["embedding"])
     for name in ("q_proj", "o_proj"):
@@ -108,64 +76,51 @@ def test_adapters_change_the_decoder_by_their_rank_and_train_the_rest(train, pad
     assert (np.asarray(found["tactile_out"]["kernel"]) != np.asarray(first["tactile_out"]["kernel"])).any()
 
 
-def test_a_curriculum_is_a_share_of_the_steps(train, padded):
-    """Here of all of them: it learns from other questions."""
-    assert train(curriculum=1.0)[1][0] != padded[1][0]
+def test_a_curriculum_is_a_share_of_the_steps(policy, data, evidence):
+    """Of all of them the first batch is felt by all sensors, which it would not be without."""
+    config = StudySFT(steps=3, batch_size=4)
+    plain, easy = (
+        next(answer_feed(policy, data, evidence, dataclasses.replace(config, curriculum=share), seed=0)).streams
+        for share in (0.0, 1.0)
+    )
+    assert np.asarray(easy).all()
+    assert not np.asarray(plain).all()
 
 
-def test_the_decoders_phase_trains_the_decoder_alone_and_returns_its_best_point(policy, data, params, tmp_path):
+def test_the_decoders_phase_trains_the_decoder_alone_and_returns_its_best_point(
+    policy, data, params, evidence, tmp_path
+):
     """The second of three points is the best, after the first step that moves; adapters are merged before a score."""
     rows = data.parts["sft"]
-    evidence = np.zeros((len(data.store), len(data.clip.sensors), data.label.shape[1], 9), np.float32)
-    for rank in (0, 2):
-        config = dataclasses.replace(tiny.STUDY.decoder, steps=3, save_every=1, lora_rank=rank)
-        order, scores, scored = {"batch_size": config.batch_size, "seed": 0}, iter([1.0, 3.0, 2.0]), []
-        clips = encoded_clips(tiny.features(len(rows)), rows, data.label[rows], **order)
-        feed = AnswerFeed(policy, clips, evidence, questions=config.questions, **order)
+    config = dataclasses.replace(tiny.STUDY.decoder, steps=3, save_every=1, lora_rank=2)
+    order, scores, scored = {"batch_size": config.batch_size, "seed": 0}, iter([1.0, 3.0, 2.0]), []
+    clips = encoded_clips(tiny.features(len(rows)), rows, data.label[rows], **order)
+    feed = AnswerFeed(policy, clips, evidence, questions=config.questions, **order)
 
-        def held_out(found, scores=scores, scored=scored):
-            scored.append(jax.tree.map(np.asarray, found))
-            return next(scores)
+    def held_out(found):
+        scored.append(jax.tree.map(np.asarray, found))
+        return next(scores)
 
-        with Checkpoints(tmp_path / str(rank), better="higher") as checkpoints:
-            hooks = Hooks(checkpoints=checkpoints)
-            found = train_sft(policy, params, feed, config, hooks, decoder_only=True, held_out=held_out)
-        jax.tree.map(np.testing.assert_array_equal, found, scored[1])
-        for name in set(params) - {"decoder"}:
-            jax.tree.map(np.testing.assert_array_equal, found[name], params[name])
-        start, second, third = (x["decoder"]["layers_0"]["q_proj"]["kernel"] for x in (params, *scored[1:]))
-        assert np.any(start != second)
-        assert np.any(second != third)
-
-
-def test_the_best_point_needs_checkpoints(policy, params):
-    with pytest.raises(ValueError, match=r"hooks\.checkpoints is None"):
-        train_sft(policy, params, iter(()), CONFIG, held_out=lambda found: 0.0)
+    with Checkpoints(tmp_path, better="higher") as checkpoints:
+        hooks = Hooks(checkpoints=checkpoints)
+        found = train_sft(policy, params, feed, config, hooks, decoder_only=True, held_out=held_out)
+    jax.tree.map(np.testing.assert_array_equal, found, scored[1])
+    for name in set(params) - {"decoder"}:
+        jax.tree.map(np.testing.assert_array_equal, found[name], params[name])
+    start, second, third = (x["decoder"]["layers_0"]["q_proj"]["kernel"] for x in (params, *scored[1:]))
+    assert np.any(start != second)
+    assert np.any(second != third)
 
 
 @pytest.mark.parametrize(("recipe", "anchor"), [("touch", 1.0), ("paper", 0.0)])
-def test_one_word_chooses_the_recipe(policy, data, params, context, recipe, anchor):
+def test_one_word_chooses_the_recipe(policy, data, params, context, evidence, recipe, anchor):
     config = dataclasses.replace(tiny.STUDY, recipe=recipe)
-    evidence = np.zeros((len(data.store), 4, 4, 9), np.float32)
     seed = StudySeed(config=config, data=data, policy=policy, evidence=evidence, context=context, seed=0)
     contacts = seed.contacts(params)
     np.testing.assert_array_equal(contacts.truth, data.label[data.parts["grpo"]])
     assert (contacts.label[:, 3] == -1).all() == (recipe == "paper")
     arm = make_study_arm(config, policy, PUBLISHED, data.prior(), config.grpo.algorithm)
     assert arm.config.algorithm.anchor == anchor
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "message"),
-    [
-        ("pack", -1, "pack is -1: must be at least 0"),
-        ("lora_rank", -1, "lora_rank is -1: must be at least 0"),
-        ("curriculum", 1.5, r"curriculum is 1\.5: must lie in 0 … 1"),
-    ],
-)
-def test_options_of_sft_keep_their_ranges(field, value, message):
-    with pytest.raises(ValueError, match=message):
-        StudySFT(**{field: value})
 
 
 def test_devices_share_a_micro_batch():
