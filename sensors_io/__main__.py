@@ -20,6 +20,8 @@ COMMANDS: Mapping[str, str] = {
     "generate": "generate.Generate",
     "check": "check.Check",
     "list": "list.List",
+    "reindex": "reindex.Reindex",
+    "push": "push.Push",
     "label": "label.Label",
     "devices": "devices.Devices",
     "view": "view.View",

@@ -4,11 +4,12 @@ import os
 import pathlib
 from collections.abc import Iterable
 
-from sensors_io.codec import decode_card, encode_card
+from sensors_io.codec import encode_card
+from sensors_io.contents import Cards
 from sensors_io.index import Index
-from sensors_io.records import write_lock
+from sensors_io.records import convert, write_lock
 from sensors_io.schema import ObjectCard, SchemaError
-from sensors_io.shards import Entries, ShardWriter
+from sensors_io.shards import ShardWriter, shard_file
 
 
 def replace_cards(path: str | os.PathLike[str], cards: Iterable[ObjectCard]) -> None:
@@ -29,22 +30,22 @@ def replace_cards(path: str | os.PathLike[str], cards: Iterable[ObjectCard]) -> 
     Index.read(root)  # before a lock file is made where there are no records
     with write_lock(root):
         index = Index.read(root)
-        stored = Entries(root, index.object_shards)
-        known = {name: stored.decode(i, decode_card) for i, name in enumerate(index.objects)}
-        new = {card.object_id: card for card in cards}
+        known, new = dict(Cards(root, index).items()), {card.object_id: card for card in cards}
         strange = sorted(set(new) - set(known))
         if strange:
             raise SchemaError(
                 f"object_id is {strange[0]!r}: {root} holds {_some(known)}; correct it or record it first"
             )
-        shard = ShardWriter(root, index.next_objects)
-        for card in {**known, **new}.values():
+        convert(root, index)
+        old, every = index.object_shards, {**known, **new}
+        shard = ShardWriter(root, "objects", index.next_objects)
+        for card in every.values():
             shard.write(encode_card(card))
-        old = index.object_shards
-        index.object_shards = [shard.publish()]
+        before = [index.tables[name].file for name in ("objects", "object-shards")]
+        index.replace_objects(root, shard.publish(), {name: card.split for name, card in every.items()})
         index.write(root)
-        for one in old:
-            (root / one.file).unlink()
+        for file in (*(shard_file("objects", number) for number in old["number"]), *before):
+            (root / file).unlink()
 
 
 def _some(names: Iterable[str], most: int = 8) -> str:

@@ -6,6 +6,7 @@ Dimensions as in the schema: N frames of a sequence, F of a clip, S sensors, P c
 import dataclasses
 import threading
 from collections.abc import Callable, Mapping
+from collections.abc import Sequence as Seq
 from typing import Any, Protocol
 
 import absl.flags
@@ -83,7 +84,7 @@ class Contacts(Protocol):
     """Contacts by number: `records.RecordStore`, or `live.LiveScenes`, which generates them on request."""
 
     @property
-    def contacts(self) -> tuple[ContactKey, ...]:
+    def contacts(self) -> Seq[ContactKey]:
         """Identity of every contact."""
 
     @property

@@ -1,11 +1,11 @@
 """Recordings on disk: ArrayRecord shards of sequences, shards of object cards, and one index that makes them visible.
 
-    index.json                     what is complete: meta, shards with their sizes, contacts → entries per sensor
+    index.json                     root of the index, see `index`: what is complete, and how much of its tables counts
     objects-00000.arrayrecord      one entry per `ObjectCard`
     contacts-00000.arrayrecord     one entry per `Sequence`: one contact seen by one sensor, all its frames
 
-A shard is written under a temporary name, closed, counted, synced and renamed; then the index is replaced.  A killed
-writer leaves every published contact readable, and the next one resumes after them.
+A shard is written under a temporary name, closed, counted, synced and renamed; then the index grows by its rows.  A
+killed writer leaves every published contact readable, and the next one resumes after them.
 
 Frames are stored as the differences that they want (`codec`, `deltas`) and each entry is compressed by ArrayRecord with
 zstd at level 1.  `pareto_storage` chose this by a rule; one shared core, bytes as a share of the raw frames and frames
@@ -20,24 +20,20 @@ import fcntl
 import hashlib
 import os
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Seq
 from types import TracebackType
 from typing import IO, Any, Self
 
 import numpy as np
 
-from sensors_io.codec import (
-    CorruptRecordsError,
-    RecordsError,
-    decode_card,
-    decode_sequence,
-    encode_card,
-    encode_sequence,
-)
-from sensors_io.index import INDEX, Index, MissingIndexError, RecordsMeta, RecordsVersionError
-from sensors_io.schema import ContactKey, ObjectCard, SchemaError, Sequence, contacts_of_split
-from sensors_io.shards import Entries, ShardWriter
+from sensors_io.codec import CorruptRecordsError, RecordsError, decode_sequence, encode_card
+from sensors_io.contents import Cards, PartWriter
+from sensors_io.index import INDEX, Index, MissingIndexError, Part, RecordsMeta, RecordsVersionError, read_root
+from sensors_io.remote import at_url, local, place
+from sensors_io.schema import SPLITS, ContactKey, ObjectCard, SchemaError, Sequence
+from sensors_io.shards import Entries, ShardWriter, shard_file
+from sensors_io.tables import ContactTable
 
 __all__ = [
     "CorruptRecordsError",
@@ -45,6 +41,7 @@ __all__ = [
     "MissingIndexError",
     "RecordStore",
     "RecordWriter",
+    "RecordsBusyError",
     "RecordsError",
     "RecordsExistError",
     "RecordsMeta",
@@ -71,6 +68,7 @@ class RecordWriter:
       meta: what the data set is.
       contacts_per_shard: contacts per published shard.
       resume: continue after the contacts of an earlier writer; `contacts_done` and `objects_done` say which.
+      kept: names of files that no index lists and that are no remains: parts that are adopted later.
 
     Raises:
       RecordsExistError: the directory holds records and `resume` is off, or they were made by another config, or
@@ -78,11 +76,19 @@ class RecordWriter:
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], *, meta: RecordsMeta, contacts_per_shard: int = 64, resume: bool = False
+        self,
+        path: str | os.PathLike[str],
+        *,
+        meta: RecordsMeta,
+        contacts_per_shard: int = 64,
+        resume: bool = False,
+        kept: Callable[[str], bool] = lambda name: False,
     ):
         if contacts_per_shard < 1:
             raise ValueError(f"contacts_per_shard is {contacts_per_shard}: must be ≥ 1; raise it")
         self._root = pathlib.Path(path)
+        if at_url(path):
+            raise RecordsError(f"{path} is a URL: records are written to a folder, then `push` uploads them; name one")
         try:
             self._root.mkdir(parents=True, exist_ok=True)
         except (FileExistsError, NotADirectoryError) as error:
@@ -92,28 +98,34 @@ class RecordWriter:
         self._per_shard = contacts_per_shard
         self._lock = write_lock(self._root)
         try:
-            self._index = _start(self._root, meta, resume)
+            self._index = _start(self._root, meta, resume, kept)
         except BaseException:
             self._lock.close()
             raise
-        self._keys = {key for key, _ in self._index.contacts}
-        self._cards: dict[str, bytes] = {}
-        self._pending: list[tuple[ContactKey, dict[str, int]]] = []
-        self._frames: dict[str, int] = {}
-        self._shard: ShardWriter | None = None
+        self._numbers = {name: n for n, name in enumerate(self._index.objects)}
+        self._shards, self._entries = len(self._index.contact_shards), int(self._index.contact_shards["entries"].sum())
+        self._next_card = self._index.next_objects
+        self._added: dict[ContactKey, None] = {}
+        self._cards: dict[str, tuple[str, bytes]] = {}
+        self._part: PartWriter | None = None
 
     @property
     def contacts_done(self) -> int:
         """Number of contacts written, those of earlier writers included; contacts keep the order of their writing."""
-        return len(self._keys)
+        return len(self._index.contacts) + len(self._added)
+
+    @property
+    def shards_done(self) -> int:
+        """Number of published shards of contacts."""
+        return self._shards
 
     @property
     def objects_done(self) -> frozenset[str]:
         """Objects whose card is written."""
-        return frozenset(self._index.objects) | self._cards.keys()
+        return frozenset(self._numbers) | self._cards.keys()
 
     def __contains__(self, key: ContactKey) -> bool:
-        return key in self._keys
+        return key in self._added or self._index.contacts.find(key) is not None
 
     @property
     def notes(self) -> Mapping[str, Any]:
@@ -130,9 +142,9 @@ class RecordWriter:
         Raises:
           SchemaError: the object is there already.
         """
-        if card.object_id in self.objects_done:
+        if card.object_id in self._numbers or card.object_id in self._cards:
             raise SchemaError(f"object_id is {card.object_id!r}: an object is stored once; drop the second card")
-        self._cards[card.object_id] = encode_card(card)
+        self._cards[card.object_id] = card.split, encode_card(card)
 
     def write_contact(self, sequences: Seq[Sequence]) -> None:
         """Store one contact: its sequences by different sensors.
@@ -141,35 +153,53 @@ class RecordWriter:
           SchemaError: no sequence, no frame, different keys, a sensor twice or unknown to the meta, a contact that is
             there already, or an object without a card.
         """
-        self._check(sequences)
-        data = [encode_sequence(sequence) for sequence in sequences]  # refuse bad input before anything is written
-        if self._shard is None:
-            self._shard = ShardWriter(self._root, f"contacts-{len(self._index.contact_shards):05d}")
-        base = sum(shard.entries for shard in self._index.contact_shards)
-        entries = {s.sensor: base + self._shard.write(d) for s, d in zip(sequences, data, strict=True)}
-        self._pending.append((sequences[0].key, entries))
-        self._keys.add(sequences[0].key)
-        for sequence in sequences:
-            self._frames[sequence.sensor] = self._frames.get(sequence.sensor, 0) + len(sequence)
-        if len(self._pending) >= self._per_shard:
+        if sequences:
+            self._check_key(sequences[0].key)
+        part = self._part or PartWriter(self._root, self._shards, self._index.meta.sensors)
+        part.write(sequences)
+        self._part = part
+        self._added[sequences[0].key] = None
+        if len(part) >= self._per_shard:
             self.publish()
+
+    def adopt(self, part: Part) -> None:
+        """Publish the next shard, which another `PartWriter` has put in its place.
+
+        Raises:
+          SchemaError: it is not the next one, or as `write_contact`.
+        """
+        if part.shard[0] != self._shards or self._part is not None:
+            raise SchemaError(f"part {part.shard[0]} is not the next one, {self._shards}: adopt parts in order")
+        for name, site, trial, motion, _ in part.contacts:
+            key = ContactKey(object_id=name, site=site, motion=motion, trial=trial)
+            self._check_key(key)
+            self._added[key] = None
+        self._publish_cards()
+        self._add(part)
+        self._index.write(self._root)
 
     def publish(self) -> None:
         """Make everything written so far visible, in a shard of its own."""
-        index = self._index
-        if self._cards:
-            cards = ShardWriter(self._root, index.next_objects)
-            for card in self._cards.values():
-                cards.write(card)
-            index.object_shards.append(cards.publish())
-            index.objects += self._cards
-            self._cards = {}
-        if self._shard is not None:
-            index.contact_shards.append(self._shard.publish())
-            index.contacts += self._pending
-            index.frames.update(self._frames)
-            self._pending, self._frames, self._shard = [], {}, None
-        index.write(self._root)
+        self._publish_cards()
+        if self._part is not None:
+            part, self._part = self._part.publish(), None
+            self._add(part)
+        self._index.write(self._root)
+
+    def _publish_cards(self) -> None:
+        if not self._cards:
+            return
+        shard = ShardWriter(self._root, "objects", self._next_card)
+        for _, data in self._cards.values():
+            shard.write(data)
+        splits = {name: split for name, (split, _) in self._cards.items()}
+        self._index.add_objects(self._root, shard.publish(), splits)
+        self._numbers |= {name: len(self._numbers) + n for n, name in enumerate(self._cards)}
+        self._cards, self._next_card = {}, self._next_card + 1
+
+    def _add(self, part: Part) -> None:
+        self._index.add_part(self._root, part, self._numbers, self._entries)
+        self._shards, self._entries = self._shards + 1, self._entries + part.shard[1]
 
     def __enter__(self) -> Self:
         return self
@@ -179,28 +209,17 @@ class RecordWriter:
     ) -> None:
         try:
             self._index.complete = kind is None
-            if kind is None or self._cards or self._shard is not None:
+            if kind is None or self._cards or self._part is not None:
                 self.publish()
         finally:
             self._lock.close()
 
-    def _check(self, sequences: Seq[Sequence]) -> None:
-        if not sequences:
-            raise SchemaError("sequences is []: a contact has at least one sequence; skip empty contacts")
-        key, sensors = sequences[0].key, [sequence.sensor for sequence in sequences]
-        if any(sequence.key != key for sequence in sequences):
-            raise SchemaError(f"{sequences[0].name}: the sequences of a contact share one key; write them apart")
-        if len(set(sensors)) != len(sensors) or not set(sensors) <= set(self._index.meta.sensors):
-            known = ", ".join(self._index.meta.sensors)
-            raise SchemaError(
-                f"{sequences[0].name}: sensors are {sensors}: each once, out of {known}; correct the meta"
-            )
-        if not all(map(len, sequences)):
-            raise SchemaError(f"{sequences[0].name}: a sequence of no frames; drop it")
-        if key in self._keys:
-            raise SchemaError(f"{sequences[0].name}: this contact is stored already; number the trials apart")
-        if key.object_id not in self.objects_done:
-            raise SchemaError(f"{sequences[0].name}: object {key.object_id!r} has no card; write_object it first")
+    def _check_key(self, key: ContactKey) -> None:
+        named = f"{key.object_id}/{key.site}/{key.motion}/{key.trial}"
+        if key in self:
+            raise SchemaError(f"{named}: this contact is stored already; number the trials apart")
+        if key.object_id not in self._numbers and key.object_id not in self._cards:
+            raise SchemaError(f"{named}: object {key.object_id!r} has no card; write_object it first")
 
 
 class RecordStore:
@@ -215,19 +234,26 @@ class RecordStore:
     """
 
     def __init__(self, path: str | os.PathLike[str], *, allow_incomplete: bool = False):
-        self.path = pathlib.Path(path)
-        self._index = Index.read(self.path)
+        self.path = place(path)
+        self._open(read_root(self.path))
         if not self._index.complete and not allow_incomplete:
             raise IncompleteRecordsError(
-                f"{self.path} holds {len(self._index.contacts)} contacts and its writing has not ended; "
+                f"{self.path} holds {len(self)} contacts and its writing has not ended; "
                 "resume the writing, or open it with allow_incomplete=True"
             )
-        self._cards = Entries(self.path, self._index.object_shards)
-        self._entries = Entries(self.path, self._index.contact_shards)
-        self.contacts: tuple[ContactKey, ...] = tuple(key for key, _ in self._index.contacts)
-        self.objects: dict[str, ObjectCard] = {}
-        for i, name in enumerate(self._index.objects):
-            self.objects[name] = self._cards.decode(i, decode_card)
+
+    def _open(self, root: dict[str, Any]) -> None:
+        self._root, self._index = root, Index.of(self.path, root)
+        self._entries = Entries(self.path, "contacts", self._index.contact_shards)
+        self.contacts: ContactTable = self._index.contacts
+        self.objects: Mapping[str, ObjectCard] = Cards(self.path, self._index)
+
+    def __getstate__(self) -> Any:
+        return self.path, self._root
+
+    def __setstate__(self, state: Any) -> None:
+        self.path = state[0]
+        self._open(state[1])  # as it was, though more may have been published since
 
     def __len__(self) -> int:
         return len(self.contacts)
@@ -244,8 +270,15 @@ class RecordStore:
 
     @property
     def digest(self) -> str:
-        """First 16 hex digits of the SHA-256 of the index: the configuration, all contacts, the size of every shard."""
-        return hashlib.sha256((self.path / INDEX).read_bytes()).hexdigest()[:16]
+        """First 16 hex digits of the SHA-256 of the root, which holds the configuration and the tables' checksums."""
+        return hashlib.sha256(local(self.path, INDEX).read_bytes()).hexdigest()[:16]
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Names of all files but the root of the index, shards first; an index before version 3 has no others."""
+        kinds = {"objects": self._index.object_shards, "contacts": self._index.contact_shards}
+        shards = [shard_file(kind, number) for kind, rows in kinds.items() for number in rows["number"].tolist()]
+        return (*shards, *(table.file for table in self._index.tables.values() if table.size))
 
     @property
     def frames(self) -> dict[str, int]:
@@ -254,21 +287,20 @@ class RecordStore:
 
     def sensors_of(self, i: int) -> tuple[str, ...]:
         """Sensors that saw contact i, without reading it."""
-        return tuple(self._index.contacts[i][1])
+        return tuple(self.contacts.entries(i))
 
     def contact(self, i: int, *, fields: bool = True) -> dict[str, Sequence]:
         """Contact i as each of its sensors saw it.
 
         Args:
-          i: index into `contacts`.
+          i: index into `contacts`; `contacts.find` gives that of a key.
           fields: False leaves out the fields of sequences that have camera frames.
 
         Raises:
           CorruptRecordsError: an entry whose checksum does not hold or that belongs to another contact.
         """
-        key, entries = self._index.contacts[i]
-        contact = {}
-        for sensor, entry in entries.items():
+        key, contact = self.contacts[i], {}
+        for sensor, entry in self.contacts.entries(i).items():
             sequence = self._entries.decode(entry, lambda data: decode_sequence(data, fields=fields))
             if sequence.key != key or sequence.sensor != sensor:
                 raise CorruptRecordsError(
@@ -283,21 +315,30 @@ class RecordStore:
         Raises:
           SchemaError: no such split.
         """
-        return contacts_of_split(self.contacts, self.objects, split)
+        if split not in SPLITS:
+            raise SchemaError(f"split is {split!r}: must be one of {', '.join(SPLITS)}; rename it")
+        splits = self._index.splits
+        of = [card.split for card in self.objects.values()] if splits is None else splits
+        chosen = np.array([one == split for one in of] or [False])[self.contacts.rows["object"]]
+        return np.flatnonzero(chosen)
+
+
+class RecordsBusyError(RecordsExistError):
+    """Records that somebody else is writing."""
 
 
 def write_lock(root: pathlib.Path) -> IO[str]:
     """An advisory lock on the directory, until it is closed or the process dies.
 
     Raises:
-      RecordsExistError: another process holds it.
+      RecordsBusyError: another process holds it.
     """
     file = (root / ".lock").open("w")
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         file.close()
-        raise RecordsExistError(
+        raise RecordsBusyError(
             f"{root} is being written by another process; wait for it or choose another path"
         ) from error
     return file
@@ -313,9 +354,9 @@ def _content(root: pathlib.Path, index: Index) -> str:
     )
 
 
-def _start(root: pathlib.Path, meta: RecordsMeta, resume: bool) -> Index:
+def _start(root: pathlib.Path, meta: RecordsMeta, resume: bool, kept: Callable[[str], bool]) -> Index:
     """The index to go on from; files that no index lists are the remains of a killed writer and are removed."""
-    index = Index(meta=meta)
+    index = Index.new(meta)
     if (root / INDEX).exists():
         index = Index.read(root)
         if not resume:
@@ -326,9 +367,22 @@ def _start(root: pathlib.Path, meta: RecordsMeta, resume: bool) -> Index:
                 f"{meta.config_hash!r}: one directory holds records of one making; choose another directory, or resume "
                 "with the options that made these; nothing was changed"
             )
+        convert(root, index)
         index.complete = False
-    listed = {shard.file for shard in index.object_shards + index.contact_shards}
-    for file in [*root.glob("*.arrayrecord"), *root.glob(".*.arrayrecord.tmp")]:
-        if file.name not in listed:
+    shards = {"contacts": index.contact_shards, "objects": index.object_shards}
+    listed = {shard_file(kind, number) for kind, rows in shards.items() for number in rows["number"].tolist()}
+    for file in [*root.glob("*.arrayrecord"), *root.glob(".*.arrayrecord.*tmp")]:
+        if file.name not in listed and not kept(file.name):
             file.unlink()
     return index
+
+
+def convert(root: pathlib.Path, index: Index) -> bool:
+    """Give an index of version 1 or 2 its tables, which its next root states; True if it had none.
+
+    The old root is valid until then, and shards stay as they are.
+    """
+    if index.tables:
+        return False
+    index.convert(root, {name: card.split for name, card in Cards(root, index).items()})
+    return True

@@ -1,61 +1,48 @@
 """ArrayRecord files as the data set uses them: written under a temporary name, read at random through one numbering."""
 
-import dataclasses
+import collections
 import os
 import pathlib
+import threading
 from collections.abc import Callable
-from collections.abc import Sequence as Seq
 from typing import TypeVar
 
+import numpy as np
 from array_record.python.array_record_data_source import ArrayRecordDataSource
 from array_record.python.array_record_module import ArrayRecordReader, ArrayRecordWriter
 
 from sensors_io.codec import CorruptRecordsError, RecordsError
+from sensors_io.remote import Place, local
+from sensors_io.tables import SHARD
 
 _OPTIONS = "group_size:1,zstd:1"
+_OPEN = 128
+"""Files that stay open: a process may open 1,024 on many systems, and a large data set has more shards."""
+
 _T = TypeVar("_T")
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Shard:
-    """One ArrayRecord file: its name, its number of entries and its size, which tells a truncated file at once."""
-
-    file: str
-    entries: int
-    bytes: int
-
-    def check(self, root: pathlib.Path) -> None:
-        """Hold the file to the size that it had when it was written.
-
-        Raises:
-          CorruptRecordsError: it is missing, or shorter or longer.
-        """
-        path = root / self.file
-        size = path.stat().st_size if path.is_file() else None
-        if size != self.bytes:
-            found = "is missing" if size is None else f"has {size} bytes where {self.bytes} were written"
-            raise CorruptRecordsError(
-                f"{path} {found}: copy it again from its source, or delete {root} and write it again"
-            )
+def shard_file(kind: str, number: int) -> str:
+    """Name of a shard of `contacts` or `objects`."""
+    return f"{kind}-{number:05d}.arrayrecord"
 
 
 class ShardWriter:
     """An ArrayRecord file under a temporary name until it is published."""
 
-    def __init__(self, root: pathlib.Path, name: str):
-        self._path = root / f"{name}.arrayrecord"
-        self._temporary = root / f".{name}.arrayrecord.tmp"
+    def __init__(self, root: pathlib.Path, kind: str, number: int):
+        self._number, self._path = number, root / shard_file(kind, number)
+        self._temporary = root / f".{self._path.name}.{os.getpid()}.tmp"  # two workers may try the same
         self._writer = ArrayRecordWriter(str(self._temporary), _OPTIONS)
         self._count = 0
 
-    def write(self, data: bytes) -> int:
-        """Append one entry and return its number in the shard."""
+    def write(self, data: bytes) -> None:
+        """Append one entry."""
         self._writer.write(data)
         self._count += 1
-        return self._count - 1
 
-    def publish(self) -> Shard:
-        """Close, count, sync and rename the file.  The writer reports no failure of its own: counting finds it."""
+    def publish(self) -> np.ndarray:
+        """Close, count, sync and rename the file; its row.  The writer reports no failure: counting finds it."""
         self._writer.close()
         reader = ArrayRecordReader(str(self._temporary))
         found = reader.num_records() if reader.ok() else 0
@@ -65,32 +52,64 @@ class ShardWriter:
         with self._temporary.open("rb") as file:
             os.fsync(file.fileno())
         self._temporary.replace(self._path)
-        return Shard(file=self._path.name, entries=found, bytes=self._path.stat().st_size)
+        return np.array((self._number, found, self._path.stat().st_size), SHARD)
 
 
 class Entries:
-    """Entries of several shards, numbered through; files are opened when they are first read."""
+    """Entries of several shards, numbered through; files are opened when they are first read, and not all stay open.
 
-    def __init__(self, root: pathlib.Path, shards: Seq[Shard]):
-        for shard in shards:
-            shard.check(root)
-        self._files = [(root / shard.file, shard.entries) for shard in shards]
-        paths = [f"{file}[0:{entries}]" for file, entries in self._files]  # the range spares opening each to count it
-        self._source = ArrayRecordDataSource(paths) if paths else []
+    Args:
+      root: where they lie.
+      kind: `contacts` or `objects`.
+      shards: rows of `SHARD`.
+
+    Raises:
+      CorruptRecordsError: a file on this machine is missing, or has not the size that it had when it was written.
+    """
+
+    def __init__(self, root: Place, kind: str, shards: np.ndarray):
+        self._root, self._kind, self._shards = root, kind, shards
+        self._ends = np.cumsum(shards["entries"], dtype=np.int64)
+        self._open: collections.OrderedDict[int, ArrayRecordDataSource] = collections.OrderedDict()
+        self._lock = threading.Lock()
+        if isinstance(root, pathlib.Path):
+            for number, size in zip(shards["number"].tolist(), shards["bytes"].tolist(), strict=True):
+                _check_size(root / shard_file(kind, number), size)
 
     def decode(self, i: int, decode: Callable[[bytes], _T]) -> _T:
         """Entry i, decoded; errors get the path of its file."""
+        shard = int(np.searchsorted(self._ends, i, side="right"))
+        place = i - int(self._ends[shard] - self._shards["entries"][shard])
         try:
-            return decode(self._source[i])
+            return decode(self._source(shard)[place])
         except (RuntimeError, CorruptRecordsError) as error:
-            file, position = self._locate(i)
+            file = f"{self._root}/{shard_file(self._kind, self._shards['number'][shard])}"
             raise CorruptRecordsError(
-                f"{file}, entry {position}: {error}; copy the file again from its source, or write the records again"
+                f"{file}, entry {place}: {error}; copy the file again from its source, or write the records again"
             ) from error
 
-    def _locate(self, i: int) -> tuple[pathlib.Path, int]:
-        for file, entries in self._files:
-            if i < entries:
-                return file, i
-            i -= entries
-        raise IndexError(i)
+    def _source(self, shard: int) -> ArrayRecordDataSource:
+        with self._lock:
+            if shard in self._open:
+                self._open.move_to_end(shard)
+                return self._open[shard]
+        row = self._shards[shard]
+        path = local(self._root, shard_file(self._kind, row["number"]), size=int(row["bytes"]))
+        source = ArrayRecordDataSource([f"{path}[0:{row['entries']}]"])  # the range spares opening it to count it
+        with self._lock:
+            source = self._open.setdefault(shard, source)
+            if len(self._open) > _OPEN:
+                self._open.popitem(last=False)  # closed when its last reader is done with it
+        return source
+
+
+def _check_size(path: pathlib.Path, bytes_: int) -> None:
+    try:
+        size = os.stat(path).st_size
+    except FileNotFoundError:
+        size = None
+    if size != bytes_:
+        found = "is missing" if size is None else f"has {size} bytes where {bytes_} were written"
+        raise CorruptRecordsError(
+            f"{path} {found}: copy it again from its source, or delete {path.parent} and write it again"
+        )

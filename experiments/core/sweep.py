@@ -3,15 +3,17 @@
     FOLDER/{sweep.json, report.html, plots/, NAME/STAMP/…}
 
 FOLDER is a folder of runs like any other: `list`, `compare` and `ask` take it.  The work is the list of `SweepUnit`s in
-`sweep.json`.  Each is one command that is done when FOLDER holds a finished run of its configuration, so that whoever
-runs them, here one after the other, needs to know nothing else.
+`sweep.json`.  Each is one command, done when FOLDER holds a finished run of its configuration, wherever it ran.
 """
 
 import dataclasses
+import functools
 import hashlib
 import itertools
 import json
+import shlex
 import signal
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -28,6 +30,7 @@ from experiments.core.report import write_report
 from experiments.core.results import Cell, Column, Estimate, Picture, Results, Table
 from experiments.core.runner import Experiment, load, parse, run_experiment
 from sensors_io.errors import UserError
+from sensors_io.units import HERE, Launcher, LauncherError, UnitsError, WorkUnit, finish
 from touchr1_jax.bench.scoring import REPORTED
 
 FOLDERS = "sweeps"
@@ -78,6 +81,10 @@ class SweepUnit:
         """Directory of its newest finished run, else of its newest one, else `None`."""
         return runs.newest(self.home, self.config, finished=True) or runs.newest(self.home, self.config, finished=False)
 
+    def finished(self) -> bool:
+        """True if it has a finished run."""
+        return runs.newest(self.home, self.config, finished=True) is not None
+
     @property
     def run(self) -> runs.PastRun | None:
         """Its run, if it has begun."""
@@ -102,6 +109,7 @@ class SweepCommand:
     """Words in the names of the figures to show, as `compare` names them; by default the main ones."""
     runs_dir: Path = Path("runs")
     """Folder of all runs."""
+    launcher: Annotated[Launcher, tyro.conf.arg(name="")] = HERE
 
     def run(self, rest: Sequence[str], package: str = "experiments") -> int:
         """Run the sweep and return the exit status; `rest` are options of the experiment."""
@@ -115,13 +123,18 @@ class SweepCommand:
         except ValueError as error:  # also a configuration that refuses its own values
             print_error(f"{type(error).__name__}: {error}")
             return 2
-        return run_sweep(experiment, about, folder, units, self.figures)
+        run = run_sweep if self.launcher.here else functools.partial(launch_sweep, self.launcher, package)
+        return run(experiment, about, folder, units, self.figures)
 
 
 def main(arguments: Sequence[str], package: str = "experiments") -> int:
     """The command line after `sweep`, for the experiments of a package; returns the exit status."""
     prog = f"{PROG} {SWEEP}"
-    command, rest = tyro.cli(SweepCommand, args=arguments, prog=prog, return_unknown_args=True)
+    try:
+        command, rest = tyro.cli(SweepCommand, args=arguments, prog=prog, return_unknown_args=True)
+    except LauncherError as error:
+        print_error(f"{type(error).__name__}: {error}")
+        return 2
     return command.run(rest, package)
 
 
@@ -203,13 +216,9 @@ def run_sweep(
 
     A signal stops the sweep with the status of its run.  `wanted` are parts of the names of the figures to show.
     """
-    scale = parse(experiment, units[0].command, about).scale
-    listed = [{"hash": u.digest, "settings": u.settings, "command": u.command, "config": u.config} for u in units]
-    folder.mkdir(parents=True, exist_ok=True)
-    write_sealed(folder / "sweep.json", {"experiment": experiment.name, "scale": scale, "units": listed})
-    failed = 0
+    scale, failed = _list_units(experiment, about, folder, units), 0
     for i, unit in enumerate(units):
-        past, title = unit.run, ", ".join(f"{name} {value}" for name, value in unit.settings.items())
+        past, title = unit.run, _title_of(unit)
         if past is not None and past.state == "finished":
             print_lines(f"{i + 1} of {len(units)}, {title}: finished before, {past.directory}")
             continue
@@ -226,6 +235,53 @@ def run_sweep(
         failed += status
     print_lines(f"sweep: {write_page(experiment.name, about, scale, folder, units, wanted)}")
     return int(failed > 0)
+
+
+def launch_sweep(
+    launcher: Launcher, package: str, experiment: Experiment[Any], about: str, folder: Path, units: Sequence[SweepUnit],
+    wanted: Sequence[str],
+) -> int:  # fmt: skip
+    """As `run_sweep`, by workers of an engine."""
+    scale = _list_units(experiment, about, folder, units)
+    run = functools.partial(_run_unit, experiment.name, package)
+    named = lambda unit: f"{unit.digest} ({_title_of(unit)})"
+    work = [WorkUnit(name=named(unit), run=functools.partial(run, unit), done=unit.finished) for unit in units]
+    try:
+        for ended, one in enumerate(finish(work, launcher, print_lines), 1):
+            print_lines(f"{ended} of {len(units)} finished: {one.name}")
+            write_page(experiment.name, about, scale, folder, units, wanted)
+    except (LauncherError, UnitsError) as error:
+        print_error(f"{type(error).__name__}: {error}")
+        return 1
+    except KeyboardInterrupt:
+        print_lines("To continue the sweep, run the same command again.")
+        return 128 + signal.SIGINT
+    print_lines(f"sweep: {write_page(experiment.name, about, scale, folder, units, wanted)}")
+    return 0
+
+
+def _run_unit(name: str, package: str, unit: SweepUnit) -> None:
+    """Run or continue the run of a unit, in a worker."""
+    experiment, about = load(name, package)
+    until = time.monotonic() + 60  # the worker of a driver that was killed lives a moment longer
+    while (run := unit.run) is not None and run.in_use and time.monotonic() < until:
+        time.sleep(1)
+    jax.clear_caches()  # of the unit before
+    if status := run_experiment(experiment, unit.command, about):
+        raise SweepError(f"{shlex.join(unit.command)} ended with status {status}: read its report in {unit.home}")
+
+
+def _list_units(experiment: Experiment[Any], about: str, folder: Path, units: Sequence[SweepUnit]) -> str:
+    """Write `sweep.json`; the scale of the runs."""
+    scale: str = parse(experiment, units[0].command, about).scale
+    listed = [{"hash": u.digest, "settings": u.settings, "command": u.command, "config": u.config} for u in units]
+    folder.mkdir(parents=True, exist_ok=True)
+    write_sealed(folder / "sweep.json", {"experiment": experiment.name, "scale": scale, "units": listed})
+    return scale
+
+
+def _title_of(unit: SweepUnit) -> str:
+    return ", ".join(f"{name} {value}" for name, value in unit.settings.items())
 
 
 def write_page(

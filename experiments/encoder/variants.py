@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
+from collections.abc import Sequence as Seq
 from typing import Any
 
 from sensors_io.pipeline import Contacts
@@ -75,7 +76,7 @@ class FieldsOnly:
         self._store = store
 
     @property
-    def contacts(self) -> tuple[ContactKey, ...]:
+    def contacts(self) -> Seq[ContactKey]:
         """Identity of every contact."""
         return self._store.contacts
 

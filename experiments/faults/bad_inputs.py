@@ -184,7 +184,7 @@ def records() -> tuple[BadInput, ...]:
     """Damaged records that `check` reads, and paths at which no records can be written."""
     index, shard, objects = "index.json", "contacts-00000.arrayrecord", "objects-00000.arrayrecord"
     corrupt, again, rewrite = "CorruptRecordsError", "copy it again", "write it again"
-    other_version = functools.partial(replaced, old='"version":2', new='"version":9')
+    other_version = functools.partial(replaced, old='"version":3', new='"version":9')
     damaged: tuple[tuple[str, str, Prepare, str, str, str], ...] = (
         ("no index", index, Path.unlink, "MissingIndexError", "records", "give the directory"),
         ("an index cut in half", index, cut, corrupt, "records", rewrite),

@@ -1,8 +1,10 @@
 """The data of an experiment: generated scenes, imported recordings, or existing records."""
 
 import dataclasses
+import functools
 import hashlib
 import json
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
@@ -12,7 +14,7 @@ from experiments.core.progress import ProgressCallback
 from sensors_io.generate import generate_records
 from sensors_io.importers.physiclear import PhysiclearConfig, import_physiclear
 from sensors_io.quality import oddities
-from sensors_io.records import RecordStore
+from sensors_io.records import RecordsBusyError, RecordStore
 from sensors_io.scenes.config import SceneConfig, config_hash
 
 Source = Literal["generated", "physiclear", "records"]
@@ -48,7 +50,8 @@ def prepare_records(config: SourceConfig, context: Context) -> Path:
     """Directory of the records, made or imported first where the cache lacks them; an interrupted one resumes."""
     if config.data_dir is None:
         path = context.cache_dir / f"scenes-{config_hash(config.scenes)}"
-        _make(context, "making scenes", lambda report: generate_records(config.scenes, path, progress=report))
+        make = functools.partial(generate_records, config.scenes, path)
+        _make(context, "making scenes", lambda report: _after_others(lambda: make(progress=report), context))
         return path
     if config.data == "records":
         return config.data_dir
@@ -82,6 +85,19 @@ def odd_contacts(config: SourceConfig, path: Path, context: Context) -> tuple[in
     if untouched:
         context.print(f"without any contact: {len(untouched)} of {len(store.objects)} objects, such as {untouched[0]}")
     return tuple(sorted({i for rows in reasons.values() for i in rows}))
+
+
+def _after_others(make: Callable[[], None], context: Context) -> None:
+    """Make records, or wait for another run of a sweep that is making the same ones."""
+    waits = False
+    while True:
+        try:
+            return make()
+        except RecordsBusyError as error:
+            if not waits:
+                context.print(f"waiting: {error}")
+            waits = True
+            time.sleep(1)
 
 
 def _make(context: Context, title: str, make: Callable[[ProgressCallback], object]) -> None:

@@ -2,6 +2,9 @@
 
 import dataclasses
 import pathlib
+from typing import Annotated
+
+import tyro
 
 from sensors_io import overview
 from sensors_io.commands.console import OUT, progress_bar
@@ -9,6 +12,7 @@ from sensors_io.generate import generate_records
 from sensors_io.records import RecordStore
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS
+from sensors_io.units import Launcher
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -21,10 +25,12 @@ class Generate:
     out: pathlib.Path
     """Directory of the records."""
     config: SceneConfig = dataclasses.field(default_factory=SceneConfig)
+    launcher: Annotated[Launcher, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Launcher)
 
     def run(self) -> int:
         each = len(SENSORS) * self.config.frame_count
         with progress_bar("records") as progress:
-            generate_records(self.config, self.out, progress=lambda done, total: progress(done * each, total * each))
+            report = lambda done, total: progress(done * each, total * each)
+            generate_records(self.config, self.out, progress=report, launcher=self.launcher)
         OUT.print(overview.summary_table(RecordStore(self.out)))
         return 0

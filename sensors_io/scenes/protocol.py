@@ -31,8 +31,8 @@ _LOOKAHEAD = 4  # contacts in flight
 _PRESS_SITE = (0, 0)  # site and trial at which every object's strength is looked at
 
 
-def contacts(config: SceneConfig, start: int = 0) -> Iterator[list[Sequence]]:
-    """Generate contacts in order, from contact `start` on.
+def contacts(config: SceneConfig, start: int = 0, stop: int | None = None) -> Iterator[list[Sequence]]:
+    """Generate contacts in order, from contact `start` on, up to `stop` or all.
 
     Each item holds one sequence per sensor, in the order of `schema.SENSORS`.  Two contacts are made at a time, on two
     threads; the order and the values do not depend on it.
@@ -41,7 +41,7 @@ def contacts(config: SceneConfig, start: int = 0) -> Iterator[list[Sequence]]:
       ValueError: a start outside the data set.
     """
     require(0 <= start <= config.contact_count, "start", start, f"must lie in [0, {config.contact_count}]")
-    return _in_order(config, start)
+    return _in_order(config, start, config.contact_count if stop is None else stop)
 
 
 def make_contact(config: SceneConfig, index: int) -> list[Sequence]:
@@ -89,9 +89,9 @@ def slot(config: SceneConfig, index: int) -> schedule.Slot:
     return schedule.press_slot(config, index) if config.sequences is None else plan(config).slots[index]
 
 
-def _in_order(config: SceneConfig, start: int) -> Iterator[list[Sequence]]:
+def _in_order(config: SceneConfig, start: int, stop: int) -> Iterator[list[Sequence]]:
     """Contacts are the unit of work, a few of them in flight."""
-    indices = iter(range(start, config.contact_count))
+    indices = iter(range(start, stop))
     pending: collections.deque[concurrent.futures.Future[list[Sequence]]] = collections.deque()
     pool = concurrent.futures.ThreadPoolExecutor(_WORKERS, thread_name_prefix="scenes")
 

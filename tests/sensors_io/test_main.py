@@ -82,15 +82,17 @@ def test_check_says_that_records_are_incomplete(run, tmp_path):
 def test_generate_hands_its_options_on(run, tmp_path, monkeypatch):
     asked = []
 
-    def generate(config, out, *, progress):
-        asked.append((config.objects, config.frames))
+    def generate(config, out, *, progress, launcher):
+        asked.append((config.objects, config.frames, launcher.engine, launcher.workers))
         progress(1, 2)
         fakes.write(out, 2)
 
     monkeypatch.setattr(generating, "generate_records", generate)
-    status, out, _ = run("generate", "--objects", "7", "--frames", "5", "--out", tmp_path / "r")
+    status, out, _ = run(
+        "generate", "--objects", "7", "--frames", "5", "--launcher.workers", "3", "--out", tmp_path / "r"
+    )
     assert status == 0
-    assert asked == [(7, 5)]
+    assert asked == [(7, 5, "local", 3)]
     assert "2 sequences" in out
 
 

@@ -302,3 +302,23 @@ class TestClipBatches:
             clip_batches(store, [], SMALL, batch_size=2, seed=0)
         with pytest.raises(SchemaError, match=r"indices reach 0\.\.7: must lie in 0\.\.6"):
             clip_batches(store, [0, 7], SMALL, batch_size=2, seed=0)
+
+
+def test_readers_that_join_or_leave_change_shares_and_not_the_epoch(store):
+    """1, then 3, then 2 readers share the batches of one epoch: every contact comes once."""
+    config, rows, batch = ClipConfig(image_px=16, view_px=8, frames=2), list(range(6)) * 4, 6
+    seen, state = [], None
+    for readers, batches in ((1, 1), (3, 2), (2, 1)):
+        shares = [range(h * batch // readers, (h + 1) * batch // readers) for h in range(readers)]
+        loads = [clip_batches(store, rows, config, batch_size=batch, seed=3, repeat=False, drop_remainder=True, own=own)
+                 for own in shares]  # fmt: skip
+        iterators = [iter(load) for load in loads]
+        for iterator in iterators:
+            if state is not None:
+                iterator.set_state(state)
+        for _ in range(batches):
+            seen += [int(i) for iterator in iterators for i in next(iterator)["contact"]]
+        state = iterators[-1].get_state()  # states are those of the whole
+    assert sorted(seen) == sorted(rows)
+    whole = clip_batches(store, rows, config, batch_size=batch, seed=3, repeat=False, drop_remainder=True)
+    assert seen == [int(i) for one in whole for i in one["contact"]]

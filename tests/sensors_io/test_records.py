@@ -3,7 +3,9 @@
 import dataclasses
 import json
 import os
+import pathlib
 import pickle
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,7 +14,9 @@ import numpy as np
 import pytest
 from array_record.python.array_record_module import ArrayRecordReader, ArrayRecordWriter
 
-from sensors_io import records
+from sensors_io import records, tables
+from sensors_io.__main__ import main
+from sensors_io.index import Index
 from sensors_io.records import RecordStore, RecordWriter
 from sensors_io.schema import SENSORS, SchemaError
 from tests.sensors_io import fakes
@@ -33,10 +37,12 @@ def rewrite(shard, change):
     for entry in change(entries):
         writer.write(entry)
     writer.close()
-    index = json.loads((shard.parent / "index.json").read_text())
-    del index["crc32"]
-    text = json.dumps(index).replace(f'"bytes": {size}', f'"bytes": {shard.stat().st_size}')
-    (shard.parent / "index.json").write_text(text)
+    index = Index.read(shard.parent)
+    rows = np.array([(row["number"], row["entries"], shard.stat().st_size if row["bytes"] == size else row["bytes"])
+                     for row in index.contact_shards], index.contact_shards.dtype)  # fmt: skip
+    table = dataclasses.replace(index.tables["contact-shards"], size=0, crc32=0)
+    index.tables["contact-shards"] = table.append(shard.parent, rows.tobytes())
+    index.write(shard.parent)
 
 
 def test_a_data_set_comes_back(tmp_path):
@@ -163,7 +169,8 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
         done = subprocess.run([sys.executable, "-c", code], check=False, cwd=os.getcwd())
         assert done.returncode == -signal.SIGKILL
-        assert [p.name for p in tmp_path.glob(".contacts*.tmp")] == [".contacts-00002.arrayrecord.tmp"]
+        [left] = tmp_path.glob(".contacts*.tmp")
+        assert left.name.startswith(".contacts-00002.arrayrecord.")
         assert len(RecordStore(tmp_path, allow_incomplete=True)) == 4
         with RecordWriter(tmp_path, meta=fakes.META, resume=True) as writer:
             assert writer.contacts_done == 4
@@ -219,9 +226,9 @@ class TestDamage:
         refused(records.CorruptRecordsError, r"index.json is damaged", RecordStore, path)
 
     def test_another_version(self, path):
-        text = (path / "index.json").read_text().replace('"version":2', '"version":3')
+        text = (path / "index.json").read_text().replace('"version":3', '"version":4')
         (path / "index.json").write_text(text)
-        refused(records.RecordsVersionError, "version 3, this code reads 'touchr1-records' versions", RecordStore, path)
+        refused(records.RecordsVersionError, "version 4, this code reads 'touchr1-records' versions", RecordStore, path)
 
     def test_a_missing_shard(self, path):
         shards(path)[1].unlink()
@@ -256,11 +263,100 @@ class TestDamage:
 
 def test_every_flipped_bit_of_the_index_is_found(tmp_path):
     fakes.write(tmp_path, 1)
-    path = tmp_path / "index.json"
-    whole = path.read_bytes()
-    end = whole.index(b', "crc32"')
-    for i in range(end):
-        for bit in (0, 4, 7):
-            path.write_bytes(whole[:i] + bytes([whole[i] ^ (1 << bit)]) + whole[i + 1 :])
-            with pytest.raises(records.RecordsError):
-                records.RecordStore(tmp_path)
+    for path in sorted(tmp_path.glob("index.*")):
+        whole = path.read_bytes()
+        end = whole.index(b', "crc32"') if path.suffix == ".json" else len(whole)
+        for i in range(end):
+            for bit in (0, 7) if path.suffix == ".json" else (i % 8,):
+                path.write_bytes(whole[:i] + bytes([whole[i] ^ (1 << bit)]) + whole[i + 1 :])
+                with pytest.raises(records.RecordsError):
+                    records.RecordStore(tmp_path)
+        path.write_bytes(whole)
+    assert len(records.RecordStore(tmp_path)) == 1
+
+
+OLD = json.loads((pathlib.Path(__file__).parent / "index_of_version_2.json").read_text())
+"""Written by the code before version 3 for the five contacts below."""
+
+
+class TestOlderIndex:
+    @pytest.fixture
+    def old(self, tmp_path):
+        """Records of version 2, as their writer left them."""
+        fakes.write(tmp_path, 5)
+        for table in tmp_path.glob("index.*"):
+            table.unlink()
+        shutil.copy(pathlib.Path(__file__).parent / "index_of_version_2.json", tmp_path / "index.json")
+        return tmp_path
+
+    def check(self, store):
+        assert [(key.object_id, key.trial) for key in store.contacts] == [(f"object_{i // 2}", i % 2) for i in range(5)]
+        assert store.frames == dict.fromkeys(SENSORS, 5 * 12)
+        np.testing.assert_array_equal(store.contacts_of_split("val"), [4])
+        for i in range(5):
+            assert store.contacts.entries(i) == OLD["contacts"][i][4]
+            got, want = store.contact(i)["xense"], fakes.sequence(i // 2, "xense", trial=i % 2)
+            np.testing.assert_array_equal(got.frames, want.frames)
+
+    def test_is_read_as_it_is(self, old):
+        before = sorted(old.iterdir())
+        self.check(RecordStore(old))
+        assert sorted(old.iterdir()) == before
+
+    def test_is_converted_by_one_command(self, old):
+        shards = {path: path.read_bytes() for path in old.glob("*.arrayrecord")}
+        for _ in range(2):  # the second time there is nothing to do
+            assert main(["reindex", str(old)]) == 0
+        assert json.loads((old / "index.json").read_text())["version"] == 3
+        self.check(RecordStore(old))
+        assert {path: path.read_bytes() for path in old.glob("*.arrayrecord")} == shards
+
+    def test_goes_on(self, old):
+        with RecordWriter(old, meta=fakes.META, resume=True) as writer:
+            assert writer.contacts_done == 5
+            writer.write_contact([fakes.sequence(2, sensor, trial=1) for sensor in SENSORS])
+        store = RecordStore(old)
+        assert len(store) == 6
+        assert store.contact(5)["xense"].key == store.contacts[5]
+
+
+class TestTables:
+    def test_a_contact_is_found_by_its_key(self, tmp_path):
+        store = RecordStore(fakes.write(tmp_path, 8))
+        assert [store.contacts.find(key) for key in store.contacts] == list(range(8))
+        key = store.contacts[0]
+        for other in ({"trial": 7}, {"site": 1}, {"motion": "slide_x"}, {"object_id": "object_9"}):
+            assert store.contacts.find(dataclasses.replace(key, **other)) is None
+
+    def test_keys_of_one_hash_are_told_apart(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(tables, "_hashed", lambda *fields: fields[0] * np.uint64(0) + np.uint64(1 << 40))
+        store = RecordStore(fakes.write(tmp_path, 8))
+        assert [store.contacts.find(key) for key in store.contacts] == list(range(8))
+        assert store.contacts.find(dataclasses.replace(store.contacts[0], trial=9)) is None
+
+    def test_what_was_appended_and_never_published_is_not_read(self, tmp_path):
+        fakes.write(tmp_path, 4)
+        before = (tmp_path / "index.contacts").read_bytes()
+        (tmp_path / "index.contacts").write_bytes(before + b"torn")
+        assert len(RecordStore(tmp_path)) == 4
+        with RecordWriter(tmp_path, meta=fakes.META, resume=True) as writer:
+            writer.write_object(fakes.card(9))
+            writer.write_contact([fakes.sequence(9)])
+        assert (tmp_path / "index.contacts").read_bytes()[: len(before)] == before
+        assert RecordStore(tmp_path).contacts[4].object_id == "object_9"
+
+    def test_more_shards_than_files_that_stay_open(self, tmp_path, monkeypatch):
+        monkeypatch.setattr("sensors_io.shards._OPEN", 2)
+        store = RecordStore(fakes.write(tmp_path, 6, per_shard=1))
+        for i in [*range(6), *range(6)]:
+            assert store.contact(i)["xense"].key == store.contacts[i]
+        assert len(store._entries._open) == 2
+
+    def test_a_pickled_store_keeps_its_contacts(self, tmp_path):
+        fakes.write(tmp_path, 4)
+        sent = pickle.dumps(RecordStore(tmp_path))
+        assert len(sent) < 4000
+        with RecordWriter(tmp_path, meta=fakes.META, resume=True) as writer:
+            writer.write_object(fakes.card(9))
+            writer.write_contact([fakes.sequence(9)])
+        assert len(pickle.loads(sent)) == 4

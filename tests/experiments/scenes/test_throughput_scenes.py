@@ -23,8 +23,8 @@ def make_contact(config, index):
     return [fakes.sequence(index, sensor, config.frame_count, key=key) for sensor in SENSORS]
 
 
-def contacts(config, start=0):
-    return (make_contact(config, i) for i in range(start, config.contact_count))
+def contacts(config, start=0, stop=None):
+    return (make_contact(config, i) for i in range(start, config.contact_count if stop is None else stop))
 
 
 def look(skins, turn_rad, modulus_mpa):

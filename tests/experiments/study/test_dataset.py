@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.study.dataset import PARTS, open_dataset, split_parts
+from sensors_io.cards import replace_cards
 from sensors_io.pipeline import ClipConfig
 from sensors_io.records import RecordStore
 from sensors_io.schema import SENSORS
@@ -47,9 +48,10 @@ def test_an_empty_part_is_refused(tmp_path, contacts, share, part):
 
 
 def test_records_without_labels_name_the_command_that_labels(tmp_path):
-    store = RecordStore(fakes.write(tmp_path, contacts=8))
-    for card in store.objects.values():
-        store.objects[card.object_id] = dataclasses.replace(card, labels={})
+    path = fakes.write(tmp_path, contacts=8)
+    cards = RecordStore(path).objects.values()
+    replace_cards(path, [dataclasses.replace(card, labels={}) for card in cards])
+    store = RecordStore(path)
     with pytest.raises(ValueError, match=r"none of the .* objects has a label: .* sensors_io label"):
         split_parts(store, 0.5)
 

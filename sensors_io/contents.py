@@ -1,0 +1,110 @@
+"""A shard of contacts as it is written, and the cards of all objects as they are read."""
+
+import collections
+import contextlib
+import pathlib
+from collections.abc import Iterator, Mapping
+from collections.abc import Sequence as Seq
+
+from sensors_io.codec import decode_card, encode_sequence
+from sensors_io.index import Index, Part
+from sensors_io.remote import Place
+from sensors_io.schema import ObjectCard, SchemaError, Sequence
+from sensors_io.shards import Entries, ShardWriter
+
+_CARDS = 4096
+"""Cards that stay in memory, with their views; where there are no more, they are read at once."""
+
+
+class PartWriter:
+    """One shard of contacts, which becomes a part of a data set when it is adopted.
+
+    Args:
+      root: directory of the data set.
+      number: of the shard.
+      sensors: of the data set.
+    """
+
+    def __init__(self, root: pathlib.Path, number: int, sensors: Seq[str]):
+        self._root, self._number, self._sensors = root, number, sensors
+        self._shard: ShardWriter | None = None
+        self._contacts: list[tuple[str, int, int, str, tuple[str, ...]]] = []
+        self._frames: collections.Counter[str] = collections.Counter()
+
+    def __len__(self) -> int:
+        return len(self._contacts)
+
+    def write(self, sequences: Seq[Sequence]) -> None:
+        """Append one contact.
+
+        Raises:
+          SchemaError: no sequence, no frame, different keys, or a sensor twice or unknown.
+        """
+        _check_contact(sequences, self._sensors)
+        encoded = [encode_sequence(sequence) for sequence in sequences]  # refuses bad input before a file is made
+        self._shard = self._shard or ShardWriter(self._root, "contacts", self._number)
+        for data in encoded:
+            self._shard.write(data)
+        key = sequences[0].key
+        self._contacts.append((key.object_id, key.site, key.trial, key.motion, tuple(s.sensor for s in sequences)))
+        for sequence in sequences:
+            self._frames[sequence.sensor] += len(sequence)
+
+    def publish(self) -> Part:
+        """The shard, in its place.
+
+        Raises:
+          SchemaError: it holds no contact.
+          RecordsError: it did not reach the disk.
+        """
+        if self._shard is None:
+            raise SchemaError(f"shard {self._number} of {self._root} holds no contact; write one first")
+        row = self._shard.publish()
+        shard = (int(row["number"]), int(row["entries"]), int(row["bytes"]))
+        return Part(shard=shard, contacts=tuple(self._contacts), frames=dict(self._frames))
+
+
+class Cards(Mapping[str, ObjectCard]):
+    """Cards of all objects by id; of many objects, read when they are asked for.
+
+    Args:
+      root: of the data set.
+      index: that names its objects.
+    """
+
+    def __init__(self, root: Place, index: Index):
+        self._numbers = {name: n for n, name in enumerate(index.objects)}
+        self._entries = Entries(root, "objects", index.object_shards)
+        self._known: collections.OrderedDict[str, ObjectCard] = collections.OrderedDict()
+        for name in self._numbers if len(self._numbers) <= _CARDS else ():
+            self[name]
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._numbers)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._numbers
+
+    def __getitem__(self, name: str) -> ObjectCard:
+        card = self._known.get(name)
+        if card is None:
+            card = self._known[name] = self._entries.decode(self._numbers[name], decode_card)
+            while len(self._known) > _CARDS:
+                with contextlib.suppress(KeyError):  # another thread may have removed it
+                    self._known.popitem(last=False)
+        return card
+
+
+def _check_contact(sequences: Seq[Sequence], known: Seq[str]) -> None:
+    if not sequences:
+        raise SchemaError("sequences is []: a contact has at least one sequence; skip empty contacts")
+    name, sensors = sequences[0].name, [sequence.sensor for sequence in sequences]
+    if any(sequence.key != sequences[0].key for sequence in sequences):
+        raise SchemaError(f"{name}: the sequences of a contact share one key; write them apart")
+    if len(set(sensors)) != len(sensors) or not set(sensors) <= set(known):
+        raise SchemaError(f"{name}: sensors are {sensors}: each once, out of {', '.join(known)}; correct the meta")
+    if not all(map(len, sequences)):
+        raise SchemaError(f"{name}: a sequence of no frames; drop it")

@@ -1,0 +1,184 @@
+"""Files at a URL, by fsspec: read through a cache of bounded size, published so that none is seen half-written.
+
+`s3://` and `gs://` need the extra `cloud`; credentials and endpoint are those that the store's own client finds, such
+as AWS_ACCESS_KEY_ID and AWS_ENDPOINT_URL.
+"""
+
+import contextlib
+import hashlib
+import os
+import pathlib
+import re
+import threading
+import time
+from collections.abc import Callable, Iterable
+from typing import Any, TypeVar
+
+import fsspec
+
+from sensors_io.codec import RecordsError
+
+CACHE, CACHE_GB = "TOUCHR1_CACHE", "TOUCHR1_CACHE_GB"
+"""Variables of the environment: folder of the cache, by default ~/.cache/touchr1, and its size, by default 50 GB."""
+
+_URL = re.compile(r"([a-z][a-z0-9+]+):/+(.+)")  # one slash is left where a URL was made a path
+_WAITS_S = (0.1, 0.3, 1.0, 3.0, 9.0)
+_T = TypeVar("_T")
+
+
+class StoreError(RecordsError):
+    """A store that cannot be reached, refuses, or does not hold what is asked for."""
+
+
+class Mirror:
+    """A folder at a URL whose files are copied to the cache when they are first read.
+
+    A copy is named by what the store says of the file (its ETag, or its size and time), so that a file that was
+    replaced is read anew.  Several processes may share one cache.
+    """
+
+    def __init__(self, url: str):
+        kind, path = _matched(url)
+        self.url, self._path = f"{kind}://{path}", path.rstrip("/")
+        try:
+            self._store = fsspec.filesystem(kind, use_listings_cache=False)
+        except (ImportError, ValueError) as error:
+            raise StoreError(
+                f"{self.url} cannot be opened ({error}): the URL must be of a kind that fsspec knows and its package "
+                "installed; pip install 'touchr1-jax[cloud]'"
+            ) from error
+        self._cache = pathlib.Path(os.environ.get(CACHE, "~/.cache/touchr1")).expanduser()
+        self._most = int(float(os.environ.get(CACHE_GB, "50")) * 1e9)
+        self._lock = threading.Lock()
+
+    def __str__(self) -> str:
+        return self.url
+
+    def __reduce__(self) -> Any:
+        return Mirror, (self.url,)
+
+    def fetch(self, name: str, size: int | None = None) -> pathlib.Path:
+        """A copy of a file in the cache; it may be removed for others once it is not read for a while.
+
+        Args:
+          name: in the folder.
+          size: that it must have, in bytes.
+
+        Raises:
+          StoreError: it is not there or has another size, or the store fails again and again.
+        """
+        about = self._retried(lambda: self._store.info(f"{self._path}/{name}"), name)
+        if size is not None and about["size"] != size:
+            raise StoreError(f"{self.url}/{name} has {about['size']} bytes where {size} were written: upload it again")
+        state = [str(about.get(key)) for key in ("ETag", "etag", "md5Hash", "size", "LastModified", "created", "mtime")]
+        named = hashlib.sha256("\0".join([self.url, name, *state]).encode()).hexdigest()[:24]
+        path = self._cache / f"{named}-{name.rpartition('/')[2]}"
+        with self._lock:
+            if not path.exists():
+                self._download(name, path, about["size"])
+            os.utime(path)  # the one that was not read for the longest time goes first
+        return path
+
+    def _download(self, name: str, path: pathlib.Path, size: int) -> None:
+        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        try:
+            self._cache.mkdir(parents=True, exist_ok=True)
+            self._make_room(size)
+            self._retried(lambda: self._store.get_file(f"{self._path}/{name}", str(temporary)), name)
+            if temporary.stat().st_size != size:
+                raise StoreError(f"{self.url}/{name}: {temporary.stat().st_size} of {size} bytes came; run it again")
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+    def _make_room(self, size: int) -> None:
+        """Remove what was not read for the longest time until `size` bytes more keep within the bound."""
+        files = []
+        for file in self._cache.iterdir():
+            with contextlib.suppress(FileNotFoundError):  # another process removes as well
+                files.append((file.stat().st_mtime, file.stat().st_size, file))
+        held = sum(bytes_ for _, bytes_, _ in files)
+        for _, bytes_, file in sorted(files):
+            if held + size <= self._most:
+                return
+            file.unlink(missing_ok=True)
+            held -= bytes_
+
+    def publish(self, folder: pathlib.Path, names: Iterable[str]) -> int:
+        """Upload files of a folder in this order, each verified; those of which the store has the MD5 are left.
+
+        Returns:
+          Bytes that were uploaded.
+        """
+        sent = 0
+        there = self._retried(lambda: _checksums(self._store, self._path), "")
+        for name in names:
+            size, target = (folder / name).stat().st_size, f"{self._path}/{name}"
+            if there.get(name) != _md5(folder / name):
+                self._retried(lambda n=name, t=target: self._store.put_file(str(folder / n), t), name)  # type: ignore[misc]
+                sent += size
+                found = self._retried(lambda t=target: self._store.info(t)["size"], name)  # type: ignore[misc]
+                if found != size:
+                    raise StoreError(f"{self.url}/{name} has {found} of {size} bytes; run the same command again")
+        return sent
+
+    def _retried(self, call: Callable[[], _T], name: str) -> _T:
+        """The call's value; failures that may pass are tried again, after longer and longer times."""
+        where = f"{self.url}/{name}".rstrip("/")
+        for wait_s in (*_WAITS_S, None):
+            try:
+                return call()
+            except FileNotFoundError as error:
+                raise StoreError(f"{where} is not there ({error}): correct the URL, or make the bucket") from error
+            except PermissionError as error:
+                raise StoreError(f"{where} is refused ({error}): correct the credentials of this store") from error
+            except Exception as error:
+                if type(error).__name__ in ("NoCredentialsError", "PartialCredentialsError", "RefreshError"):
+                    raise StoreError(f"{where}: {error}: set the credentials of this store") from error
+                if wait_s is None:
+                    raise StoreError(
+                        f"{where}: {type(error).__name__}: {error}, {len(_WAITS_S) + 1} times: wait until the store "
+                        "answers, and run the same command again"
+                    ) from error
+                time.sleep(wait_s)
+        raise AssertionError
+
+
+Place = pathlib.Path | Mirror
+"""A folder on this machine, or at a URL."""
+
+
+def at_url(path: str | os.PathLike[str]) -> bool:
+    """True of a URL, also of one that was made a path."""
+    return _URL.fullmatch(os.fspath(path)) is not None
+
+
+def place(path: str | os.PathLike[str]) -> Place:
+    """The folder that a path or a URL names."""
+    return Mirror(os.fspath(path)) if at_url(path) else pathlib.Path(path)
+
+
+def local(root: Place, name: str, size: int | None = None) -> pathlib.Path:
+    """A file of a folder on this machine; see `Mirror.fetch`."""
+    return root / name if isinstance(root, pathlib.Path) else root.fetch(name, size)
+
+
+def _matched(url: str) -> tuple[str, str]:
+    found = _URL.fullmatch(url)
+    if found is None:
+        raise StoreError(f"url is {url!r}: must be KIND://PATH, as in s3://bucket/records; correct it")
+    return found[1], found[2]
+
+
+def _checksums(store: Any, path: str) -> dict[str, str]:
+    """File → MD5 of a folder of a store where it tells one; nothing where the folder does not exist yet."""
+    try:
+        listed = store.ls(path, detail=True)
+    except FileNotFoundError:
+        return {}
+    return {one["name"].rpartition("/")[2]: str(one.get("ETag", "")).strip('"') for one in listed}
+
+
+def _md5(path: pathlib.Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, lambda: hashlib.md5(usedforsecurity=False)).hexdigest()

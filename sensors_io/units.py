@@ -1,0 +1,287 @@
+"""Work as units that are each done once, and the engines that run them: this machine, Ray, or Slurm by submitit.
+
+A unit is named by the hash of what it computes, takes its randomness from there, and writes its result in one step, so
+that it does not matter where, in which order and beside what it runs.  Whoever lists the units asks which are done and
+has the others run; a driver that was killed is started again with the same command.
+"""
+
+import concurrent.futures
+import dataclasses
+import functools
+import hashlib
+import importlib
+import importlib.metadata
+import os
+import pathlib
+import platform
+import shutil
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from typing import Annotated, Any, Literal, Protocol
+
+import tyro
+
+from sensors_io.errors import UserError
+
+AGAIN = 8
+"""Times that a unit is run again after its worker died: one that needs more memory than there is must end."""
+
+POLL_S = 0.02
+
+_PACKAGES = ("jax", "jaxlib", "numpy", "flax", "optax", "grain", "array-record")
+
+
+class LauncherError(UserError):
+    """An engine that is not there, or workers that differ from the driver; the message says the fix."""
+
+
+class UnitsError(UserError):
+    """Units that failed; the message names the first, and that the others stay."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WorkUnit:
+    """Some work with a result under a name of its own.
+
+    Attributes:
+      name: of the result: a hash of everything that decides it.
+      run: makes the result and puts it in its place in one step; pickled to workers.
+      done: True if the result is there.
+    """
+
+    name: str
+    run: Callable[[], object]
+    done: Callable[[], bool]
+
+
+class Handle(Protocol):
+    """Some units that an engine runs; a future of Python, Ray or submitit."""
+
+    def done(self) -> bool:
+        """True once they have ended."""
+
+    def exception(self) -> BaseException | None:
+        """The error that ended them, if one did."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Launcher:
+    """Where units run."""
+
+    engine: Annotated[
+        Literal["local", "ray", "slurm"], tyro.conf.arg(name="launcher", prefix_name=False, help="Runs the units.")
+    ] = "local"
+    workers: Annotated[int, tyro.conf.arg(name="launcher.workers", prefix_name=False)] = 1
+    """Processes; of an existing Ray cluster, all of its cores."""
+    address: Annotated[str, tyro.conf.arg(name="launcher.address", prefix_name=False)] = ""
+    """Of a Ray cluster, `auto` for the one on this machine; without it one is started here."""
+    partition: Annotated[str, tyro.conf.arg(name="launcher.partition", prefix_name=False)] = ""
+    """Of Slurm, `local` for submitit's own processes on this machine."""
+
+    def __post_init__(self) -> None:
+        if self.workers < 1:
+            raise LauncherError(f"launcher.workers is {self.workers}: must be ≥ 1; raise it")
+        for name, engine in (("address", "ray"), ("partition", "slurm")):
+            if getattr(self, name) and self.engine != engine:
+                raise LauncherError(f"launcher.{name} is of {engine}: leave it out, or set --launcher {engine}")
+
+    @property
+    def here(self) -> bool:
+        """True if units run in this process, one after the other."""
+        return self.engine == "local" and self.workers == 1
+
+
+HERE = Launcher()
+"""This process."""
+
+
+def finish(units: Sequence[WorkUnit], launcher: Launcher, say: Callable[[str], object] = print) -> Iterator[WorkUnit]:
+    """Have the units run that are not done, and yield each of them as soon as it is.
+
+    Args:
+      units: the work.
+      launcher: where it runs.
+      say: gets a line for each unit that is run again.
+
+    Raises:
+      LauncherError: before anything is computed.
+      UnitsError: after all the others are done.
+    """
+    missing = []
+    for unit in units:
+        if unit.done():
+            yield unit
+        else:
+            missing.append(unit)
+    if launcher.here:
+        for unit in missing:
+            unit.run()
+            yield unit
+    elif missing:
+        yield from _run(missing, launcher, say)
+
+
+def _run(units: Sequence[WorkUnit], launcher: Launcher, say: Callable[[str], object]) -> Iterator[WorkUnit]:
+    died, submit, close = _ENGINES[launcher.engine](launcher)
+    size = -(-len(units) // launcher.workers) if launcher.engine == "slurm" else 1  # a job compiles once for its share
+    groups = [tuple(units[i : i + size]) for i in range(0, len(units), size)]
+    failed: list[tuple[WorkUnit, BaseException]] = []
+    try:
+        pending: dict[Handle, tuple[tuple[WorkUnit, ...], int]] = {}
+        pending |= {handle: (group, 0) for handle, group in zip(submit(groups), groups, strict=True)}
+        while pending:
+            for handle in [handle for handle in pending if handle.done()]:
+                group, deaths = pending.pop(handle)
+                error = handle.exception()
+                left = group if error is None else tuple(unit for unit in group if not unit.done())
+                yield from group if error is None else (unit for unit in group if unit not in left)
+                if error is not None and left and isinstance(error, died) and deaths < AGAIN:
+                    say(f"{left[0].name}: its worker died; {len(left)} of {len(group)} units are run again")
+                    pending[submit([left])[0]] = left, deaths + 1
+                elif error is not None and left:
+                    failed.append((left[0], getattr(error, "cause", None) or error))
+            time.sleep(POLL_S)
+    finally:
+        close()
+    if failed:
+        unit, error = failed[0]
+        raise UnitsError(
+            f"{len(failed)} of {len(units)} units failed, the first {unit.name}: {type(error).__name__}: {error}; the "
+            "others stay: mend it and run the same command again"
+        ) from error
+
+
+_Group = tuple[WorkUnit, ...]
+_Engine = tuple[tuple[type[BaseException], ...], Callable[[Sequence[_Group]], list[Any]], Callable[[], object]]
+"""Errors of a worker that died, the function that submits groups of units, and the one that ends the engine."""
+
+
+def _local(launcher: Launcher) -> _Engine:
+    """A process for each of some threads, so that one that dies ends no other."""
+    threads, pools = concurrent.futures.ThreadPoolExecutor(launcher.workers), threading.local()
+    context = importlib.import_module("multiprocessing").get_context("spawn")
+    made: list[concurrent.futures.ProcessPoolExecutor] = []
+
+    def call(group: tuple[WorkUnit, ...]) -> None:
+        if not hasattr(pools, "mine"):
+            pools.mine = concurrent.futures.ProcessPoolExecutor(1, mp_context=context)
+            made.append(pools.mine)
+        try:
+            pools.mine.submit(_work, group, None, os.getcwd()).result()
+        except BrokenProcessPool:
+            del pools.mine
+            raise
+
+    def close() -> None:
+        threads.shutdown(cancel_futures=True)
+        for pool in made:
+            pool.shutdown()
+
+    return (BrokenProcessPool,), lambda groups: [threads.submit(call, group) for group in groups], close
+
+
+def _ray(launcher: Launcher) -> _Engine:
+    """A cluster that is there, or one on this machine; every node is asked first what it has installed."""
+    ray = _engine("ray", "ray")
+    started = not ray.is_initialized()
+    if started:
+        own = {} if launcher.address else {"num_cpus": launcher.workers, "include_dashboard": False}
+        try:
+            ray.init(address=launcher.address or "local", log_to_driver=False, logging_level="ERROR", **own)
+        except Exception as error:  # a node that does not start raises it bare
+            where = f"answers at {launcher.address!r}" if launcher.address else "starts here"
+            raise LauncherError(
+                f"no Ray cluster {where} ({' '.join(str(error).split())[:200]}): start one by `ray start --head`, with "
+                "the same versions, and name it by --launcher.address"
+            ) from error
+    node = importlib.import_module("ray.util.scheduling_strategies").NodeAffinitySchedulingStrategy
+    asked = ray.remote(num_cpus=0, max_retries=0)(check_versions)
+    try:
+        alive = [one["NodeID"] for one in ray.nodes() if one["Alive"]]
+        ray.get([asked.options(scheduling_strategy=node(n, soft=False)).remote(versions()) for n in alive])
+    except ray.exceptions.RayError as error:
+        cause = getattr(error, "cause", None)
+        raise LauncherError(str(cause) if isinstance(cause, LauncherError) else _foreign(error)) from error
+    died = tuple(getattr(ray.exceptions, name) for name in ("WorkerCrashedError", "NodeDiedError", "OutOfMemoryError"))
+    work = ray.remote(num_cpus=1, max_retries=0)(_work)
+    where = os.getcwd()
+    submit = lambda groups: [work.remote(group, None, where).future() for group in groups]
+    return died, submit, ray.shutdown if started else lambda: None
+
+
+def _slurm(launcher: Launcher) -> _Engine:
+    """A job array; `local` is submitit's executor of processes."""
+    submitit = _engine("submitit", "slurm")
+    here = launcher.partition == "local"
+    if not here and shutil.which("sbatch") is None:
+        raise LauncherError(
+            "no Slurm cluster is here (sbatch is not found): run this on its login node, or set --launcher local"
+        )
+    executor = submitit.AutoExecutor(folder=pathlib.Path(".submitit").absolute(), cluster="local" if here else "slurm")
+    executor.update_parameters(name="touchr1", timeout_min=24 * 60)
+    if not here:
+        executor.update_parameters(slurm_array_parallelism=launcher.workers)
+    if launcher.partition and not here:
+        executor.update_parameters(slurm_partition=launcher.partition)
+    died, work = (
+        submitit.core.utils.UncompletedJobError,
+        functools.partial(_work, expected=versions(), where=os.getcwd()),
+    )
+    return (died,), lambda groups: executor.map_array(work, groups), lambda: None
+
+
+_ENGINES: Mapping[str, Callable[[Launcher], _Engine]] = {"local": _local, "ray": _ray, "slurm": _slurm}
+
+
+def _work(group: Sequence[WorkUnit], expected: Mapping[str, str] | None, where: str) -> None:
+    """Run what is not done of some units; in a worker."""
+    if expected is not None:
+        check_versions(expected)
+    os.chdir(where)  # relative paths are the driver's
+    for unit in group:
+        if not unit.done():
+            unit.run()
+
+
+def _engine(package: str, extra: str) -> Any:
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise LauncherError(
+            f"--launcher {extra} needs {package}, which is not installed: pip install 'touchr1-jax[{extra}]'"
+        ) from error
+
+
+def _foreign(error: BaseException) -> str:
+    """A worker that cannot even say what it has installed."""
+    last = str(error).strip().splitlines()[-1]
+    return f"a worker cannot import this project ({last}): install the same version of it on all machines"
+
+
+@functools.cache
+def versions() -> Mapping[str, str]:
+    """Versions that decide the bits of a result: Python, the packages, and a hash of this project's sources."""
+    found = {"python": platform.python_version()}
+    found |= {name: importlib.metadata.version(name) for name in _PACKAGES}
+    root, sum_ = pathlib.Path(__file__).parent.parent, hashlib.sha256()
+    for package in ("touchr1_jax", "sensors_io", "experiments"):
+        for path in sorted((root / package).rglob("*.py")):
+            sum_.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    return {**found, "touchr1-jax": sum_.hexdigest()[:12]}
+
+
+def check_versions(expected: Mapping[str, str]) -> None:
+    """Compare this worker with the driver.
+
+    Raises:
+      LauncherError: a version differs.
+    """
+    for name, version in versions().items():
+        if version != expected.get(name):
+            raise LauncherError(
+                f"worker {socket.gethostname()} has {name} {version}, the driver {expected.get(name)}: results would "
+                "differ; install the same versions on all machines"
+            )

@@ -1,0 +1,180 @@
+"""Records at a URL are those that were pushed: through a bounded cache, over failures, and never half-written."""
+
+import hashlib
+import pathlib
+
+import fsspec
+import numpy as np
+import pytest
+from fsspec.implementations.memory import MemoryFileSystem
+
+from sensors_io import remote
+from sensors_io.__main__ import main
+from sensors_io.records import CorruptRecordsError, RecordsError, RecordStore, RecordWriter
+from sensors_io.remote import Mirror, StoreError, place
+from tests.sensors_io import fakes
+from tests.sensors_io.checks import refused
+
+URL = "memory://bucket/records"
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    """A cache of its own, an empty store, and no waiting."""
+    monkeypatch.setenv(remote.CACHE, str(tmp_path / "cache"))
+    monkeypatch.setattr(remote, "_WAITS_S", (0.0,) * 5)
+    store = fsspec.filesystem("memory")
+    store.store.clear()
+    yield tmp_path / "cache"
+    store.store.clear()
+
+
+@pytest.fixture
+def records(tmp_path):
+    return fakes.write(tmp_path / "records", 7, per_shard=2)
+
+
+def same(left: RecordStore, right: RecordStore) -> bool:
+    for i in range(len(left)):
+        for sensor, sequence in left.contact(i).items():
+            np.testing.assert_array_equal(sequence.flags, right.contact(i)[sensor].flags)
+            np.testing.assert_array_equal(sequence.depth_mm, right.contact(i)[sensor].depth_mm)
+    return left.contacts == right.contacts and list(left.objects) == list(right.objects)
+
+
+def test_records_at_a_url_are_those_that_were_pushed(records, cache):
+    assert main(["push", str(records), URL]) == 0
+    there = RecordStore(URL)
+    assert same(RecordStore(records), there)
+    assert str(there.path) == URL
+    assert RecordStore(pathlib.Path(URL)).digest == there.digest == RecordStore(records).digest  # as an option's value
+
+
+def test_a_second_push_sends_what_is_new(records, monkeypatch):
+    ls = MemoryFileSystem.ls
+    tagged = lambda self, one: {**one, "ETag": f'"{hashlib.md5(self.cat_file(one["name"])).hexdigest()}"'}
+    monkeypatch.setattr(MemoryFileSystem, "ls", lambda self, *a, **k: [tagged(self, x) for x in ls(self, *a, **k)])
+    assert main(["push", str(records), URL]) == 0
+    before = {name: bytes(file.getvalue()) for name, file in fsspec.filesystem("memory").store.items()}
+    with RecordWriter(records, meta=fakes.META, resume=True) as writer:
+        writer.write_object(fakes.card(9))
+        writer.write_contact([fakes.sequence(9)])
+    assert (
+        Mirror(URL).publish(records, [*RecordStore(records).files, "index.json"]) < sum(map(len, before.values())) / 2
+    )
+    after = {name: bytes(file.getvalue()) for name, file in fsspec.filesystem("memory").store.items()}
+    assert all(after[name] == data for name, data in before.items() if name.endswith(".arrayrecord"))
+    assert same(RecordStore(records), RecordStore(URL))
+
+
+def test_the_cache_keeps_within_its_bound(records, cache, monkeypatch):
+    assert main(["push", str(records), URL]) == 0
+    most = 3 * max(path.stat().st_size for path in records.glob("contacts-*.arrayrecord"))
+    monkeypatch.setenv(remote.CACHE_GB, str(most / 1e9))
+    monkeypatch.setattr("sensors_io.shards._OPEN", 1)
+    store = RecordStore(URL)
+    for i in [*range(7), *range(7)]:
+        assert store.contact(i)["xense"].key == store.contacts[i]
+        assert sum(path.stat().st_size for path in cache.iterdir()) <= most
+
+
+def test_what_was_replaced_at_the_url_is_read_anew(records, tmp_path):
+    assert main(["push", str(records), URL]) == 0
+    assert len(RecordStore(URL)) == 7
+    fsspec.filesystem("memory").rm("/bucket/records", recursive=True)
+    assert main(["push", str(fakes.write(tmp_path / "other", 3)), URL]) == 0
+    assert len(RecordStore(URL)) == 3
+    assert same(RecordStore(tmp_path / "other"), RecordStore(URL))
+
+
+class Failing:
+    """A store of which a call in `every` fails, or all do."""
+
+    def __init__(self, store, every, error):
+        self._store, self._every, self._error, self.calls = store, every, error, 0
+
+    def __getattr__(self, name):
+        method = getattr(self._store, name)
+
+        def call(*args, **kwargs):
+            self.calls += 1
+            if self.calls % self._every == 0:
+                raise self._error
+            return method(*args, **kwargs)
+
+        return call
+
+
+@pytest.fixture
+def failing(monkeypatch):
+    def fail(every, error):
+        found = fsspec.filesystem
+        monkeypatch.setattr(remote.fsspec, "filesystem", lambda *a, **k: Failing(found(*a, **k), every, error))
+
+    return fail
+
+
+def test_failures_that_pass_change_nothing(records, failing):
+    failing(3, OSError("SlowDown"))
+    assert main(["push", str(records), URL]) == 0
+    assert same(RecordStore(records), RecordStore(URL))
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (
+            OSError("SlowDown"),
+            "OSError: SlowDown, 6 times: wait until the store answers, and run the same command again",
+        ),
+        (PermissionError("Forbidden"), "is refused .Forbidden.: correct the credentials"),
+        (FileNotFoundError("NoSuchBucket"), "is not there .NoSuchBucket.: correct the URL, or make the bucket"),
+        (type("NoCredentialsError", (Exception,), {})("none found"), "none found: set the credentials of this store"),
+    ],
+    ids=["fails", "refuses", "bucket", "credentials"],
+)
+def test_a_store_that_fails_is_named(records, failing, error, message):
+    failing(1, error)
+    refused(StoreError, message, lambda: RecordStore(URL))
+    refused(StoreError, message, lambda: Mirror(URL).publish(records, ["index.json"]))
+
+
+def test_an_interrupted_push_shows_nothing_and_goes_on(records, monkeypatch, capsys):
+    put = Mirror.publish
+
+    def publish(self, folder, names):
+        put(self, folder, names[:2])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Mirror, "publish", publish)
+    assert main(["push", str(records), URL]) == 130
+    refused(StoreError, f"{URL}/index.json is not there .*correct the URL", lambda: RecordStore(URL))
+    monkeypatch.setattr(Mirror, "publish", put)
+    assert main(["push", str(records), URL]) == 0
+    assert same(RecordStore(records), RecordStore(URL))
+
+
+def test_damage_at_the_url_is_named(records):
+    assert main(["push", str(records), URL]) == 0
+    store = fsspec.filesystem("memory")
+    store.pipe_file("/bucket/records/contacts-00001.arrayrecord", b"short")
+    refused(StoreError, "contacts-00001.arrayrecord has 5 bytes where .* upload it again", RecordStore(URL).contact, 2)
+    store.rm_file("/bucket/records/contacts-00001.arrayrecord")
+    refused(StoreError, "contacts-00001.arrayrecord is not there", RecordStore(URL).contact, 2)
+    store.pipe_file("/bucket/records/index.contacts", b"\0" * (records / "index.contacts").stat().st_size)
+    refused(CorruptRecordsError, "its checksum does not hold", lambda: RecordStore(URL))
+
+
+def test_records_are_not_written_to_a_url(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for path in (URL, pathlib.Path(URL)):
+        refused(RecordsError, "is a URL: records are written to a folder, then `push`", fakes.write, path)
+    assert not list(tmp_path.glob("memory*"))
+
+
+def test_kinds_that_are_not_installed_are_named():
+    refused(
+        StoreError, r"nowhere://x cannot be opened .*pip install 'touchr1-jax\[cloud\]'", lambda: Mirror("nowhere://x")
+    )
+    assert isinstance(place("a/b:c"), pathlib.Path)
+    assert isinstance(place("/a"), pathlib.Path)

@@ -1,0 +1,148 @@
+"""Units are each done once by whichever engine: a worker that dies costs its unit a second run, and no other."""
+
+import functools
+import os
+import pathlib
+import signal
+import sys
+
+import pytest
+
+from sensors_io import units
+from sensors_io.units import Launcher, LauncherError, UnitsError, WorkUnit, check_versions, finish, versions
+from tests.sensors_io.checks import refused
+
+ENGINES = {
+    "here": Launcher(),
+    "processes": Launcher(workers=2),
+    "ray": Launcher(engine="ray", workers=2),
+    "submitit": Launcher(engine="slurm", workers=2, partition="local"),
+}
+NEEDS = {"ray": "ray", "submitit": "submitit"}
+
+
+def write(folder: pathlib.Path, name: str, ends: str = "") -> None:
+    """Note the attempt, then write the result; the first attempt may end as `ends` says."""
+    with (folder / f"{name}.attempts").open("a") as file:
+        file.write(f"{os.getpid()}\n")
+    first = len((folder / f"{name}.attempts").read_text().split()) == 1
+    if first and ends == "kill":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if ends == "raise":
+        raise ValueError(f"{name} cannot be made")
+    (folder / f"{name}.tmp").write_text(name)
+    (folder / f"{name}.tmp").replace(folder / name)
+
+
+def listed(folder: pathlib.Path, count: int = 6, **ends: str) -> list[WorkUnit]:
+    names = [f"u{i}" for i in range(count)]
+    run = lambda name: functools.partial(write, folder, name, ends.get(name, ""))
+    return [WorkUnit(name=name, run=run(name), done=(folder / name).exists) for name in names]
+
+
+def attempts(folder: pathlib.Path) -> dict[str, int]:
+    return {path.stem: len(path.read_text().split()) for path in sorted(folder.glob("*.attempts"))}
+
+
+@pytest.fixture(params=ENGINES)
+def launcher(request, tmp_path, monkeypatch):
+    if request.param in NEEDS:
+        pytest.importorskip(NEEDS[request.param], reason=f"the extra of {request.param} is not installed")
+    monkeypatch.chdir(tmp_path)
+    return ENGINES[request.param]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "made").mkdir()
+    return tmp_path / "made"
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_every_unit_is_run_once_and_none_that_is_done(launcher, folder):
+    (folder / "u2").write_text("made before")
+    said = []
+    assert {unit.name for unit in finish(listed(folder), launcher, said.append)} == {f"u{i}" for i in range(6)}
+    assert attempts(folder) == {f"u{i}": 1 for i in (0, 1, 3, 4, 5)}
+    assert (folder / "u2").read_text() == "made before"
+    assert said == []
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_killed_worker_costs_its_unit_one_more_run(launcher, folder):
+    if launcher.here:
+        pytest.skip("the driver itself would die")
+    said = []
+    ended = list(finish(listed(folder, u1="kill", u4="kill"), launcher, said.append))
+    assert sorted(unit.name for unit in ended) == [f"u{i}" for i in range(6)]
+    assert attempts(folder) == {f"u{i}": 1 + (i in (1, 4)) for i in range(6)}
+    assert len(said) == 2
+    assert all("its worker died" in line for line in said)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_unit_that_fails_is_named_after_the_others_are_done(launcher, folder):
+    if launcher.here:
+        pytest.skip("here it raises its own error, with its own traceback")
+    work = listed(folder, u1="raise")
+    with pytest.raises(UnitsError, match=r"^1 of 6 units failed, the first u1: .*u1 cannot be made"):
+        list(finish(work, launcher))
+    done = {path.name for path in folder.glob("u?")}
+    if launcher.engine != "slurm":  # where the share of a job ends with the unit that failed
+        assert done == {"u0", "u2", "u3", "u4", "u5"}
+    assert attempts(folder)["u1"] == 1
+
+
+def test_a_worker_that_dies_each_time_ends(folder, monkeypatch):
+    monkeypatch.setattr(units, "AGAIN", 1)
+    unit = WorkUnit(name="u", run=functools.partial(os._exit, 9), done=(folder / "u").exists)
+    said = []
+    with pytest.raises(UnitsError, match="1 of 1 units failed"):
+        list(finish([unit], Launcher(workers=2), said.append))
+    assert len(said) == 1
+
+
+@pytest.mark.parametrize(("engine", "package"), [("ray", "ray"), ("slurm", "submitit")])
+def test_an_extra_that_is_not_installed_is_named(engine, package, folder, monkeypatch):
+    monkeypatch.setitem(sys.modules, package, None)
+    message = rf"needs {package}, which is not installed: pip install 'touchr1-jax\[{engine}\]'"
+    refused(LauncherError, message, lambda: list(finish(listed(folder), Launcher(engine=engine))))
+    assert not attempts(folder)
+
+
+def test_a_cluster_that_is_not_there_is_named(folder, monkeypatch):
+    pytest.importorskip("ray")
+    launcher = Launcher(engine="ray", address="127.0.0.1:1")
+    refused(
+        LauncherError,
+        "no Ray cluster answers at '127.0.0.1:1'.*ray start --head",
+        lambda: list(finish(listed(folder), launcher)),
+    )
+    assert not attempts(folder)
+
+
+def test_slurm_without_a_cluster_is_named(folder, monkeypatch):
+    pytest.importorskip("submitit")
+    monkeypatch.setattr(units.shutil, "which", lambda name: None)
+    refused(LauncherError, "no Slurm cluster is here", lambda: list(finish(listed(folder), Launcher(engine="slurm"))))
+
+
+def test_options_that_do_not_belong_together_are_named():
+    refused(LauncherError, "launcher.workers is 0: must be ≥ 1", lambda: Launcher(workers=0))
+    refused(LauncherError, "launcher.address is of ray", lambda: Launcher(address="auto"))
+    refused(LauncherError, "launcher.partition is of slurm", lambda: Launcher(engine="ray", partition="gpu"))
+
+
+def test_workers_with_other_versions_are_refused():
+    check_versions(versions())
+    message = "has numpy .*, the driver 1.0: results would differ; install the same versions on all machines"
+    refused(LauncherError, message, lambda: check_versions({**versions(), "numpy": "1.0"}))
+
+
+def test_another_project_on_the_workers_is_refused_before_anything_runs(folder, monkeypatch, tmp_path):
+    pytest.importorskip("submitit")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(units, "versions", lambda: {**versions(), "numpy": "1.0"})
+    with pytest.raises(UnitsError, match=r"LauncherError: worker .* has numpy"):
+        list(finish(listed(folder), Launcher(engine="slurm", workers=2, partition="local")))
+    assert not attempts(folder)
