@@ -18,6 +18,7 @@ import shutil
 import socket
 import threading
 import time
+import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from typing import Annotated, Any, Literal, Protocol
@@ -64,7 +65,10 @@ class Handle(Protocol):
         """True once they have ended."""
 
     def exception(self) -> BaseException | None:
-        """The error that ended them, if one did."""
+        """The error of the worker, if it had one."""
+
+    def result(self) -> dict[str, str]:
+        """Name → error of the units that failed."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -128,7 +132,7 @@ def _run(units: Sequence[WorkUnit], launcher: Launcher, say: Callable[[str], obj
     died, submit, close = _ENGINES[launcher.engine](launcher)
     size = -(-len(units) // launcher.workers) if launcher.engine == "slurm" else 1  # a job compiles once for its share
     groups = [tuple(units[i : i + size]) for i in range(0, len(units), size)]
-    failed: list[tuple[WorkUnit, BaseException]] = []
+    failed = dict[str, str]()
     try:
         pending: dict[Handle, tuple[tuple[WorkUnit, ...], int]] = {}
         pending |= {handle: (group, 0) for handle, group in zip(submit(groups), groups, strict=True)}
@@ -136,22 +140,23 @@ def _run(units: Sequence[WorkUnit], launcher: Launcher, say: Callable[[str], obj
             for handle in [handle for handle in pending if handle.done()]:
                 group, deaths = pending.pop(handle)
                 error = handle.exception()
-                left = group if error is None else tuple(unit for unit in group if not unit.done())
-                yield from group if error is None else (unit for unit in group if unit not in left)
-                if error is not None and left and isinstance(error, died) and deaths < AGAIN:
+                wrong = {u.name: _line(error) for u in group if not u.done()} if error else handle.result()
+                yield from (unit for unit in group if unit.name not in wrong)
+                left = tuple(unit for unit in group if unit.name in wrong)
+                if left and isinstance(error, died) and deaths < AGAIN:
                     say(f"{left[0].name}: its worker died; {len(left)} of {len(group)} units are run again")
                     pending[submit([left])[0]] = left, deaths + 1
-                elif error is not None and left:
-                    failed.append((left[0], getattr(error, "cause", None) or error))
+                else:
+                    failed |= wrong
             time.sleep(POLL_S)
     finally:
         close()
     if failed:
-        unit, error = failed[0]
+        name, why = next(iter(failed.items()))
         raise UnitsError(
-            f"{len(failed)} of {len(units)} units failed, the first {unit.name}: {type(error).__name__}: {error}; the "
-            "others stay: mend it and run the same command again"
-        ) from error
+            f"{len(failed)} of {len(units)} units failed, the first {name}: {why}; the others stay: mend it and run "
+            "the same command again"
+        )
 
 
 _Group = tuple[WorkUnit, ...]
@@ -165,12 +170,12 @@ def _local(launcher: Launcher) -> _Engine:
     context = importlib.import_module("multiprocessing").get_context("spawn")
     made: list[concurrent.futures.ProcessPoolExecutor] = []
 
-    def call(group: tuple[WorkUnit, ...]) -> None:
+    def call(group: tuple[WorkUnit, ...]) -> dict[str, str]:
         if not hasattr(pools, "mine"):
             pools.mine = concurrent.futures.ProcessPoolExecutor(1, mp_context=context)
             made.append(pools.mine)
         try:
-            pools.mine.submit(_work, group, None, os.getcwd()).result()
+            return pools.mine.submit(_work, group, None, os.getcwd()).result()
         except BrokenProcessPool:
             del pools.mine
             raise
@@ -188,8 +193,11 @@ def _ray(launcher: Launcher) -> _Engine:
     ray = _engine("ray", "ray")
     started = not ray.is_initialized()
     if started:
+        host, _, port = launcher.address.rpartition("//")[2].rpartition(":")
         own = {} if launcher.address else {"num_cpus": launcher.workers, "include_dashboard": False}
         try:
+            if port:
+                socket.create_connection((host, int(port)), timeout=10).close()  # Ray itself tries for minutes
             ray.init(address=launcher.address or "local", log_to_driver=False, logging_level="ERROR", **own)
         except Exception as error:  # a node that does not start raises it bare
             where = f"answers at {launcher.address!r}" if launcher.address else "starts here"
@@ -236,14 +244,26 @@ def _slurm(launcher: Launcher) -> _Engine:
 _ENGINES: Mapping[str, Callable[[Launcher], _Engine]] = {"local": _local, "ray": _ray, "slurm": _slurm}
 
 
-def _work(group: Sequence[WorkUnit], expected: Mapping[str, str] | None, where: str) -> None:
-    """Run what is not done of some units; in a worker."""
-    if expected is not None:
-        check_versions(expected)
+def _work(group: Sequence[WorkUnit], expected: Mapping[str, str] | None, where: str) -> dict[str, str]:
+    """Run what is not done of some units, in a worker; name → error of those that failed."""
+    failed = dict[str, str]()
+    try:
+        check_versions(expected or versions())
+    except LauncherError as error:
+        return {unit.name: _line(error) for unit in group}
     os.chdir(where)  # relative paths are the driver's
     for unit in group:
-        if not unit.done():
-            unit.run()
+        try:
+            if not unit.done():
+                unit.run()
+        except Exception as error:
+            traceback.print_exc()  # in the worker's log; the driver names the error
+            failed[unit.name] = _line(error)
+    return failed
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 def _engine(package: str, extra: str) -> Any:
