@@ -115,12 +115,19 @@ def warm_start(
 ) -> SeedPolicy:
     """SFT on touches drawn at random, and look-ups in what the policy then believes about validation objects."""
     bank = world.bank
-    learned = part_of(bank, world.parts["warm"])
-    params = warm_up(policy, learned, contacts, config.warm, context, f"warm/{seed}", seed)
+    params = warm_params(world, policy, config, contacts, seed, context)
     answer = answerer(policy, params, bank)
     val = beliefs_of(world, answer, "val")
     look = look_up(bank, val, contacts, config.kept)
     return SeedPolicy(policy=policy, params=params, answer=answer, val=val, look=look)
+
+
+def warm_params(
+    world: TouchWorld, policy: ActivePolicy, config: LearnerConfig, contacts: int, seed: int, context: Context
+) -> Params:
+    """SFT on touches drawn at random about the objects of the warm start."""
+    learned = part_of(world.bank, world.parts["warm"])
+    return warm_up(policy, learned, contacts, config.warm, context, f"warm/{seed}", seed)
 
 
 def beliefs_of(world: TouchWorld, answer: Answer, part: str) -> Beliefs:
@@ -165,20 +172,7 @@ def reinforced(
     world: TouchWorld, warm: SeedPolicy, config: LearnerConfig, name: str, arm: Arm, seed: int, context: Context
 ) -> dict[str, Any]:
     """Outcomes of a reinforced policy on test objects, and of its contacts answered by the warm start, as JSON."""
-    loop = LoopConfig(steps=config.steps, save_every=max(1, config.steps))
-    params = reinforce(
-        warm.policy,
-        warm.params,
-        part_of(world.bank, world.parts["reinforced"]),
-        config.grpo,
-        arm.budget,
-        arm.prices,
-        config.dropout,
-        loop,
-        context,
-        f"grpo/{name}/{seed}",
-        seed,
-    )
+    params = reinforced_params(world, warm.policy, warm.params, config, name, arm, seed, context)
     objects = world.parts["test"]
     found = explore(warm.policy, params, world.bank, objects, arm.budget)
     own_answers = play(world.bank, objects, found.choices, warm.answer)
@@ -186,6 +180,32 @@ def reinforced(
     unseeing = explore(warm.policy, params, unseen, objects, arm.budget)
     chosen_unseen = play(world.bank, objects, unseeing.choices, answerer(warm.policy, params, world.bank))
     return as_json({name: found, f"{name}_warm_answers": own_answers, f"{name}_unseen": chosen_unseen})
+
+
+def reinforced_params(
+    world: TouchWorld,
+    policy: ActivePolicy,
+    params: Params,
+    config: LearnerConfig,
+    name: str,
+    arm: Arm,
+    seed: int,
+    context: Context,
+) -> Params:
+    """GRPO on the objects of that part, from the parameters of a warm start."""
+    return reinforce(
+        policy,
+        params,
+        part_of(world.bank, world.parts["reinforced"]),
+        config.grpo,
+        arm.budget,
+        arm.prices,
+        config.dropout,
+        LoopConfig(steps=config.steps, save_every=max(1, config.steps)),
+        context,
+        f"grpo/{name}/{seed}",
+        seed,
+    )
 
 
 def one_step_look_ahead(

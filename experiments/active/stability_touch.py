@@ -1,0 +1,169 @@
+"""Does every seed find from reward alone which touch each question needs?
+
+    python -m experiments stability_touch [--scale smoke]
+
+The policy of one touch of `active_touch`, whose contacts and readers it shares, over ten seeds.  Each seed warm-starts
+on touches drawn at random and then learns from reward; no label says which touch is good.  A question is found where
+the commonest first motion about test objects is the one that is best by linear probes, or lies within the interval of
+its accuracy.  The alarms of policies that explore (A1 to A5) are those that rang during training.
+
+Cost: five minutes of CPU time a seed, and the contacts, thirteen minutes once (`smoke` one minute).
+
+Expected: four of five questions in at least eight of ten seeds, and no alarm.
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+import numpy as np
+
+from experiments.active import active_touch
+from experiments.active.arms import Arm, LearnerConfig, as_json, from_json, make_policy, reinforced_params, warm_params
+from experiments.active.contacts import PROPERTIES
+from experiments.active.plans import NO_CHOICE, Played
+from experiments.active.policies import explore
+from experiments.active.report import found_motion
+from experiments.active.world import TouchWorld, WorldConfig, make_world
+from experiments.core.context import Context, read_metrics
+from experiments.core.errors import ConfigurationError
+from experiments.core.results import Requirement, Results, Table, at_least, named_table
+from experiments.core.runner import Experiment
+from experiments.study.alarm_log import ALARM
+from touchr1_jax.models.active_policy import ActivePolicy
+
+ENOUGH = 4
+"""Questions of five whose motion a seed must find."""
+
+SHARE = 80.0
+"""Per cent of the seeds that must find so many."""
+
+NAME = "chosen"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StabilityTouchConfig:
+    """Contacts, learner and seeds.
+
+    Args:
+      world: contacts, encoder, parts of the objects.
+      learner: training of the policies.
+      contacts: most contacts of a trajectory of the warm start.
+      seeds, first_seed: of the policies.
+    """
+
+    world: WorldConfig = WorldConfig()
+    learner: LearnerConfig = LearnerConfig()
+    contacts: int = 3
+    seeds: int = 10
+    first_seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.seeds < 1 or self.first_seed < 0:
+            raise ConfigurationError(
+                f"seeds, first_seed are {self.seeds}, {self.first_seed}: must be at least 1 and 0; raise them"
+            )
+
+
+def run(config: StabilityTouchConfig, context: Context) -> Results:
+    """Train the policy of every seed, and see where it begins."""
+    world = make_world(config.world, context)
+    policy = make_policy(world, config.learner)
+    played: dict[int, Played] = {}
+    for seed in context.each("seeds", range(config.first_seed, config.first_seed + config.seeds)):
+        compute = functools.partial(_one_seed, world, policy, config, seed, context)
+        played[seed] = from_json(context.once(f"played/{seed}", compute))[NAME]
+        context.print(f"seed {seed}: {', '.join(found_questions(world, played[seed]))} found")
+    found = {seed: found_questions(world, one) for seed, one in played.items()}
+    alarms = alarms_of(context)
+    return Results(
+        verdict=(verdict(found, alarms),),
+        requirements=requirements(found),
+        tables=(seed_table(world, played, alarms),),
+        settings={
+            "choices": len(world.bank.choices),
+            "objects": ", ".join(f"{name} {len(rows)}" for name, rows in world.parts.items()),
+            "preset": type(config.learner.grpo.algorithm).__name__.lower(),
+        },
+    )
+
+
+def _one_seed(
+    world: TouchWorld, policy: ActivePolicy, config: StabilityTouchConfig, seed: int, context: Context
+) -> dict[str, Any]:
+    """Outcomes of the policy of one touch about test objects, as JSON."""
+    learner = config.learner
+    warm = warm_params(world, policy, learner, config.contacts, seed, context)
+    params = reinforced_params(world, policy, warm, learner, NAME, Arm(budget=1), seed, context)
+    return as_json({NAME: explore(policy, params, world.bank, world.parts["test"], 1)})
+
+
+def found_questions(world: TouchWorld, played: Played) -> list[str]:
+    """Questions whose first motion is the probes' best, or within the interval of its accuracy."""
+    probes, setup = world.probes.of(world.parts["test"]), world.config.contacts
+    return [p for a, p in enumerate(PROPERTIES) if found_motion(setup, played.choices[:, a, 0], probes, a)]
+
+
+def alarms_of(context: Context) -> dict[int, dict[str, int]]:
+    """Seed → code of each alarm that rang in its reinforcement → the first step."""
+    found: dict[int, dict[str, int]] = {}
+    for line in read_metrics(context.directory):
+        kind, _, seed = line["stage"].rpartition("/")
+        if kind == f"grpo/{NAME}":
+            of_seed = found.setdefault(int(seed), {})
+            for name in line:
+                if name.startswith(ALARM):
+                    of_seed.setdefault(name.removeprefix(ALARM), line["step"])
+    return found
+
+
+def requirements(found: dict[int, list[str]]) -> tuple[Requirement, ...]:
+    """The share of seeds that find enough."""
+    enough = 100 * float(np.mean([len(names) >= ENOUGH for names in found.values()]))
+    note = f"{[len(names) for names in found.values()]} questions of {len(PROPERTIES)} in the seeds"
+    return (at_least(f"seeds whose first motion is the probes' for {ENOUGH} of 5 questions", enough, SHARE, "%", note),)
+
+
+def verdict(found: dict[int, list[str]], alarms: dict[int, dict[str, int]]) -> str:
+    """Seeds that find enough, and alarms."""
+    enough = sum(len(names) >= ENOUGH for names in found.values())
+    rang = [f"{code} in seed {seed}" for seed, codes in alarms.items() for code in codes]
+    return (
+        f"{enough} of {len(found)} seeds find the motion of at least {ENOUGH} of {len(PROPERTIES)} questions from "
+        f"reward alone; alarms: {', '.join(rang) or 'none'}."
+    )
+
+
+def seed_table(world: TouchWorld, played: dict[int, Played], alarms: dict[int, dict[str, int]]) -> Table:
+    """First motion by question in every seed, a star where it is not the probes'."""
+    motions = [motion for _, motion, _ in world.config.contacts.choices]
+    rows: list[dict[str, Any]] = []
+    for seed, one in played.items():
+        found = found_questions(world, one)
+        row: dict[str, Any] = {"seed": str(seed)}
+        for a, name in enumerate(PROPERTIES):
+            touched = [motions[c] for c in one.choices[:, a, 0] if c != NO_CHOICE]
+            first = max(sorted(set(touched)), key=touched.count) if touched else "none"
+            row[name] = first if name in found else f"{first} *"
+        right, touches = 100 * float(one.right.mean()), float(one.contacts.mean())
+        rows.append(row | {"right": right, "touches": touches, "alarms": " ".join(alarms.get(seed, {})) or "none"})
+    return named_table(
+        "First motion in every seed",
+        rows,
+        formats={"right": ".1f", "touches": ".2f"},
+        units={"right": "%"},
+        note="The commonest first motion about test objects; a star marks one that is worse than the interval of the "
+        "probes' best.",
+    )
+
+
+SMOKE = StabilityTouchConfig(world=active_touch.SMOKE.world, learner=active_touch.SMOKE.learner, contacts=2, seeds=2)
+
+EXPERIMENT = Experiment(
+    name="stability_touch",
+    config=StabilityTouchConfig(),
+    scales={"smoke": SMOKE},
+    run=run,
+    curves={"grpo": ("accuracy", "reward", "first_kind_information", "actions")},
+    quick=("smoke",),
+)
