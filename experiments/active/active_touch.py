@@ -11,6 +11,9 @@ policy's own beliefs.  Controls: touches at random, the best press, the best tou
 each question (all looked up on validation objects), a look-up order with a threshold on belief, imitation of a one-step
 look-ahead, a policy whose observations are hidden while it chooses, every touch, the exact optimum over trees.
 
+`--physiclear DIR` adds real touch: several videos of an object as contacts, and a policy that learns when to stop.
+`--agents` adds PPO of Stable-Baselines3 in the same environment.
+
 Cost: 77 minutes beside other work, 64 of them of user CPU time, with contacts that were made before: the first seed,
 which trains all arms, 36 minutes, each further seed eight to twelve.  The contacts take about thirteen minutes of CPU
 time, once (`smoke` one minute and a half).
@@ -23,9 +26,12 @@ makes none of it and answers worse.
 import dataclasses
 import functools
 from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from experiments.active.agents import AGENT, AgentConfig, agent_played, agents_table, check_installed
 from experiments.active.arms import (
     EVERY_TOUCH,
     Arm,
@@ -42,11 +48,13 @@ from experiments.active.arms import (
     warm_start,
 )
 from experiments.active.contacts import PROPERTIES, ContactsConfig
+from experiments.active.cost import cost_requirements, cost_table, step_cost
 from experiments.active.encoder import ContactEncoderConfig
 from experiments.active.findings import findings
 from experiments.active.headroom import headroom
 from experiments.active.plans import Played
 from experiments.active.report import headroom_table
+from experiments.active.videos import VideosConfig, stopping
 from experiments.active.world import TouchWorld, WorldConfig, make_world
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
@@ -69,6 +77,10 @@ class ActiveTouchConfig:
       harm_price: price of a contact past the strain limit for the arm that pays it.
       seeds: of the policies.
       full_seeds: seeds that also train with a price of harm, at further prices, and by imitation.
+      physiclear: folder of real videos as `physiclear` reads it; `None` leaves real touch out.
+      videos: folds and policies of real touch.
+      agents: train agents of other libraries too, which must be installed.
+      agent: their training.
     """
 
     world: WorldConfig = WorldConfig()
@@ -79,6 +91,10 @@ class ActiveTouchConfig:
     harm_price: float = 0.5
     seeds: int = 5
     full_seeds: int = 1
+    physiclear: Path | None = None
+    videos: VideosConfig = VideosConfig()
+    agents: bool = False
+    agent: AgentConfig = AgentConfig()
 
     def __post_init__(self) -> None:
         given = self.seeds, self.full_seeds, self.contacts
@@ -89,6 +105,8 @@ class ActiveTouchConfig:
         for name in ("second_price", "second_prices", "harm_price"):
             if not (np.isfinite(getattr(self, name)) & (np.asarray(getattr(self, name)) >= 0)).all():
                 raise ConfigurationError(f"{name} is {getattr(self, name)}: must be finite and at least 0; correct it")
+        if self.agents:
+            check_installed()
 
     def arms(self, seed: int) -> dict[str, Arm]:
         """The reinforced policies of a seed."""
@@ -103,6 +121,7 @@ class ActiveTouchConfig:
 
 def run(config: ActiveTouchConfig, context: Context) -> Results:
     """Make the world, report the headroom, train and score every seed."""
+    real = None if config.physiclear is None else stopping(config.videos, config.physiclear, context)
     world = make_world(config.world, context)
     policy = make_policy(world, config.learner)
     tables = [_headroom(world, config, context)]
@@ -111,7 +130,14 @@ def run(config: ActiveTouchConfig, context: Context) -> Results:
         found, own = _seed(world, policy, config, seed, context)
         seeds.append(found)
         tables += own
-    return findings(world, config.learner, config.contacts, seeds, tables, config.arms(0))
+    results = findings(world, config.learner, config.contacts, seeds, tables, config.arms(0))
+    cost = context.load_stage("cost")
+    return dataclasses.replace(
+        results,
+        requirements=(*results.requirements, *cost_requirements(cost)),
+        tables=(*results.tables, cost_table(cost), *(() if real is None else real[:1])),
+        pictures=(*results.pictures, *(() if real is None else real[1:])),
+    )
 
 
 def _headroom(world: TouchWorld, config: ActiveTouchConfig, context: Context) -> Table:
@@ -135,7 +161,8 @@ def _seed(
         tables.append(headroom_table(headroom(warm.val, test, config.contacts, learner.kept), "the warm start"))
         _print(tables[0], context)
         found[EVERY_TOUCH] = every_touch(world, test)
-    for name, arm in config.arms(seed).items():
+    arms = config.arms(seed)
+    for name, arm in arms.items():
         compute = functools.partial(reinforced, world, warm, learner, name, arm, seed, context)
         found |= from_json(context.once(f"played/{name}/{seed}", compute))
         context.print(_line(name, found[name]))
@@ -143,12 +170,33 @@ def _seed(
         compute = functools.partial(one_step_look_ahead, world, warm, learner, seed, context)
         found |= from_json(context.once(f"played/imitation/{seed}", compute))
     several = counted("chosen", config.contacts)
+    if seed == 0:
+        context.once("cost", lambda: step_cost(world, warm, learner, config.contacts, context))
+        played, table = _agents(world, policy, config, {1: arms["chosen"], config.contacts: arms[several]}, context)
+        found |= played
+        tables.append(table)
     for plan in ("random", "best_press", "best_fixed", "by_question"):
         seconds = float(found[several].seconds.mean())
         found[f"{plan}_at_equal_seconds"] = dataclasses.replace(
             found[several], right=at_seconds(found, plan, seconds, config.contacts)
         )
     return found, tables
+
+
+def _agents(
+    world: TouchWorld, policy: ActivePolicy, config: ActiveTouchConfig, arms: Mapping[int, Arm], context: Context
+) -> tuple[dict[str, Played], Table]:
+    """Agents of another library at the prices of these arms, by their number of contacts, and a table of them."""
+    found: dict[str, Played] = {}
+    settings: dict[str, Any] = {}
+    for contacts, arm in arms.items() if config.agents else ():
+        name = counted(AGENT, contacts)
+        compute = functools.partial(agent_played, world, policy, arm, config.agent, name, 0, context)
+        saved = context.once(f"played/{name}", compute)
+        found |= from_json(saved["played"])
+        settings[name] = saved["settings"]
+        context.print(_line(name, found[name]))
+    return found, agents_table(settings, config.agent.steps)
 
 
 def _line(name: str, played: Played) -> str:

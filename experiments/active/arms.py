@@ -22,6 +22,7 @@ from experiments.active.plans import (
     until_sure,
 )
 from experiments.active.policies import answerer, explore, imitate, part_of, reinforce, single_beliefs, warm_up
+from experiments.active.saved import publish
 from experiments.active.world import TouchWorld
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
@@ -173,6 +174,7 @@ def reinforced(
 ) -> dict[str, Any]:
     """Outcomes of a reinforced policy on test objects, and of its contacts answered by the warm start, as JSON."""
     params = reinforced_params(world, warm.policy, warm.params, config, name, arm, seed, context)
+    context.processes.write_once(lambda: publish(world, warm.policy, params, arm.budget, name, seed, context.directory))
     objects = world.parts["test"]
     found = explore(warm.policy, params, world.bank, objects, arm.budget)
     own_answers = play(world.bank, objects, found.choices, warm.answer)

@@ -25,7 +25,8 @@ from sensors_io.scenes.cards import solid_of
 from sensors_io.scenes.config import PROTOCOL_FRAMES, SceneConfig, config_hash
 from sensors_io.scenes.schedule import Slot, pace
 from sensors_io.scenes.sequence import make_sequence
-from sensors_io.schema import EXPLORATORY, SENSORS, Flag, Sequence
+from sensors_io.schema import EXPLORATORY, SENSORS, Flag, SchemaError, Sequence
+from sensors_io.selection import choose_frames as salient_frames
 from sensors_io.selection import field_images, pick_frames
 
 PROPERTIES = ("hardness", "roughness", "protrusion", "elasticity", "friction")
@@ -151,23 +152,52 @@ def object_contacts(config: ContactsConfig, index: int) -> tuple[UInt8[np.ndarra
     """Frames and harm of all choices of object number `index`; each motion and force touches a place of its own."""
     frames, harm = {}, {}
     tasks = list(itertools.product(config.motions, config.forces_n))
-    for site, (motion, force) in enumerate(tasks):
-        slot = Slot(object_index=index, site=site, motion=motion, force_n=force)
+    for motion, force in tasks:
         for sensor in config.sensors:
-            made = make_sequence(config.scenes, index * len(tasks) + site, slot, SENSORS.index(sensor), 0)
+            made = one_contact(config, index, (sensor, motion, force))
             frames[sensor, motion, force] = kept_frames(made, config)
             harm[sensor, motion, force] = bool(np.any(made.flags & np.uint32(Flag.STRAIN_LIMIT)))
     return np.stack([frames[c] for c in config.choices]), np.array([harm[c] for c in config.choices])
 
 
+def one_contact(config: ContactsConfig, index: int, choice: tuple[str, str, float]) -> Sequence:
+    """The contact of object number `index` by one choice."""
+    tasks = list(itertools.product(config.motions, config.forces_n))
+    sensor, motion, force = choice
+    site = tasks.index((motion, force))
+    slot = Slot(object_index=index, site=site, motion=motion, force_n=force)
+    return make_sequence(config.scenes, index * len(tasks) + site, slot, SENSORS.index(sensor), 0)
+
+
 def kept_frames(sequence: Sequence, config: ContactsConfig) -> UInt8[np.ndarray, "F H W 3"]:
-    """The frames that are kept: the picture, and below it the displacement and depth fields at half its rows.
+    """The frames that are kept of a generated contact: the untouched one, and frames spread over what changes."""
+    return frames_at(sequence, choose_frames(sequence.phase, config.moments), config)
+
+
+def recorded_frames(sequence: Sequence, config: ContactsConfig) -> UInt8[np.ndarray, "F H W 3"]:
+    """The frames that are kept of a recording, whose phases nothing tells: those that stand for it.
+
+    Raises:
+      SchemaError: fewer frames than are kept.
+    """
+    chosen = salient_frames(sequence, config.moments, ())
+    if len(chosen) < config.moments:
+        raise SchemaError(f"{sequence.name} has {len(chosen)} frames: must have {config.moments}; record longer")
+    return frames_at(sequence, chosen, config)
+
+
+def frames_at(sequence: Sequence, chosen: Int[np.ndarray, "F"], config: ContactsConfig) -> UInt8[np.ndarray, "F H W 3"]:
+    """Pictures at these positions, and below them the displacement and depth fields at half their rows.
 
     A sensor without a camera has a black picture; a field that a sensor does not measure is 128.
     """
-    picked = pick_frames(sequence, choose_frames(sequence.phase, config.moments))
+    picked = pick_frames(sequence, chosen)
     wide, half = config.picture_px, config.picture_px // 2
-    fields = np.stack([cv2.resize(x, (wide, half), interpolation=cv2.INTER_AREA) for x in field_images(picked)])
+    resized = lambda images, rows: np.stack([cv2.resize(x, (wide, rows), interpolation=cv2.INTER_AREA) for x in images])
+    measured = picked.deformation_mm is not None or picked.depth_mm is not None
+    fields = resized(field_images(picked), half) if measured else np.full((config.moments, half, wide, 3), 128.0)
     fields = np.clip(np.rint(fields), 0, 255).astype(np.uint8)
-    pictures = np.zeros((config.moments, wide, wide, 3), np.uint8) if picked.frames is None else picked.frames
+    pictures = np.zeros((config.moments, wide, wide, 3), np.uint8)
+    if picked.frames is not None:
+        pictures = picked.frames if picked.frames.shape[1:3] == (wide, wide) else resized(picked.frames, wide)
     return np.concatenate([pictures, fields], 1)

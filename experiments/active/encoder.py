@@ -102,22 +102,67 @@ def contact_statistics(bank: ContactBank, context: Context) -> Float[np.ndarray,
     return np.stack([np.asarray(patch_statistics(x)) for x in context.each("statistics of contacts", bank.frames)])
 
 
-def belief_tokens(log_probs: Float[np.ndarray, "O C A K"]) -> Float[np.ndarray, "O C A W"]:
-    """One token for each property, W = A + K: which one it is, and its log-probabilities less their mean."""
+def belief_scale(log_probs: Float[np.ndarray, "*n A K"]) -> float:
+    """Standard deviation of the log-probabilities less their mean."""
+    return float((log_probs - log_probs.mean(-1, keepdims=True)).std())
+
+
+def belief_tokens(log_probs: Float[np.ndarray, "*n A K"], scale: float) -> Float[np.ndarray, "*n A W"]:
+    """One token for each property, W = A + K: which one it is, and its log-probabilities less their mean, over a scale.
+
+    Contacts that are read later take the `belief_scale` of those that a policy learned from.
+    """
     centred = log_probs - log_probs.mean(-1, keepdims=True)
     names = np.broadcast_to(np.eye(log_probs.shape[-2]), (*log_probs.shape[:-1], log_probs.shape[-2]))
-    return np.concatenate([names, centred / centred.std()], -1).astype(np.float32)
+    return np.concatenate([names, centred / scale], -1).astype(np.float32)
 
 
-def encoder_beliefs(
+@struct.dataclass
+class ContactReader:
+    """A trained network, and the statistics of the objects that it learned from."""
+
+    params: Params
+    centre: Float[np.ndarray, "C D"]
+    spread: Float[np.ndarray, "C D"]
+
+    def scaled(self, statistics: Float[np.ndarray, "*n D"], choice: Int[np.ndarray, "*n"]) -> Float[np.ndarray, "*n D"]:
+        """Statistics of contacts as the network reads them."""
+        centre, spread = self.centre[choice], self.spread[choice]
+        scaled = (statistics - centre) / np.maximum(spread, _CONSTANT) * (spread > _CONSTANT)
+        return np.clip(scaled, -FAR, FAR).astype(np.float32)
+
+
+def read_contacts(
+    config: ContactEncoderConfig,
+    reader: ContactReader,
+    statistics: Float[np.ndarray, "n D"],
+    choice: Int[np.ndarray, "n"],
+) -> Float[np.ndarray, "n A K"]:
+    """Log-probabilities of every level from contacts."""
+    network = _network(SingleContact(config, len(reader.centre)))
+    return np.asarray(network(reader.params, reader.scaled(statistics, choice), choice))
+
+
+@functools.cache
+def _network(module: SingleContact) -> Any:
+    """Compiled forward pass."""
+
+    def read(params: Params, statistics: Float[Array, "n D"], choice: Int[Array, "n"]) -> Float[Array, "n A K"]:
+        scores: Any = module.apply({"params": params}, statistics, choice)
+        return jax.nn.log_softmax(scores)
+
+    return jax.jit(read)
+
+
+def train_reader(
     config: ContactEncoderConfig,
     statistics: Float[np.ndarray, "O C D"],
     label: Int[np.ndarray, "O A"],
     objects: Int[np.ndarray, "n"],
     context: Context,
     seed: int,
-) -> Float[np.ndarray, "O C A K"]:
-    """Log-probabilities of every level from every contact, by a network of some objects.
+) -> ContactReader:
+    """A network that learned from the contacts of some objects.
 
     Args:
       config: of the network.
@@ -127,10 +172,9 @@ def encoder_beliefs(
       context: of the run.
       seed: of parameters and draws, and the number of its stage.
     """
-    centre, spread = statistics[objects].mean(0), statistics[objects].std(0)
-    scaled = (statistics - centre) / np.maximum(spread, _CONSTANT) * (spread > _CONSTANT)
-    scaled = np.clip(scaled, -FAR, FAR).astype(np.float32)
     choice = np.arange(statistics.shape[1], dtype=np.int32)
+    fresh = ContactReader(params={}, centre=statistics[objects].mean(0), spread=statistics[objects].std(0))
+    scaled = fresh.scaled(statistics, np.broadcast_to(choice, statistics.shape[:2]))
     module = SingleContact(config, len(choice))
 
     def draw(rng: np.random.Generator) -> ContactBatch:
@@ -143,13 +187,7 @@ def encoder_beliefs(
     state = EncoderState(params=params, opt_state=optimizer.init(params), step=jnp.zeros((), jnp.int32))
     loop = LoopConfig(steps=config.steps, save_every=max(1, config.steps))
     params = run_loop(step, state, DrawnFeed(draw, seed), loop, context, f"encoder/{seed}").params
-
-    @jax.jit
-    def read(of_object: Float[Array, "C D"]) -> Float[Array, "C A K"]:
-        scores: Any = module.apply({"params": params}, of_object, choice)
-        return jax.nn.log_softmax(scores)
-
-    return np.stack([np.asarray(read(x)) for x in scaled])
+    return dataclasses.replace(fresh, params=jax.device_get(params))
 
 
 @functools.cache

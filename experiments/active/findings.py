@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from experiments.active import report
+from experiments.active.agents import AGENT
 from experiments.active.arms import EVERY_TOUCH, Arm, LearnerConfig, counted
 from experiments.active.contacts import PROPERTIES
 from experiments.active.headroom import BY_BELIEF, BY_QUESTION, Beliefs, headroom
@@ -302,6 +303,8 @@ def curves(
     found |= {rule.replace("_", " "): [point(counted(rule, k)) for k in range(1, contacts + 1)] for rule in RULES}
     found["by question until sure"] = [point(f"until_{100 * t:.0f}") for t in learner.thresholds]
     found["imitation of a look-ahead"] = [point("imitation")]
+    if AGENT in seeds[0]:
+        found["PPO of Stable-Baselines3"] = [point(AGENT), point(counted(AGENT, contacts))]
     found["every contact"] = [point(EVERY_TOUCH)]
     return found
 

@@ -2,15 +2,25 @@
 
 import dataclasses
 import io
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from flax import traverse_util
+from jaxtyping import Float, Int
 
 from experiments.active.contacts import ContactBank, ContactsConfig, contacts_hash, generate
-from experiments.active.encoder import ContactEncoderConfig, belief_tokens, contact_statistics, encoder_beliefs
+from experiments.active.encoder import (
+    ContactEncoderConfig,
+    ContactReader,
+    belief_scale,
+    belief_tokens,
+    contact_statistics,
+    read_contacts,
+    train_reader,
+)
 from experiments.active.headroom import Beliefs
 from experiments.active.probes import PROBE, contact_features, crossed, probe_beliefs
 from experiments.core.artifacts import write_bytes
@@ -26,7 +36,9 @@ PARTS = ("warm", "reinforced", "val", "test")
 They are disjoint: a policy that is reinforced on objects that its warm start knows by heart finds every touch equally
 good.  The encoders learn from the first two, each object read by one that did not."""
 
-VERSION = 2
+READERS = "readers"  # prefix of their arrays
+
+VERSION = 3
 """Raised whenever the same configuration would give other tokens or beliefs."""
 
 
@@ -54,7 +66,11 @@ class WorldConfig:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TouchWorld:
-    """Encoded contacts and what is known of them; `read` are beliefs of the encoders, `probes` of probes."""
+    """Encoded contacts and what is known of them.
+
+    `probes` are beliefs of probes, and `read` those of probes and readers together, which the tokens hold.  `readers`
+    and `scale` make tokens of contacts that come later.
+    """
 
     config: WorldConfig
     contacts: ContactBank
@@ -62,6 +78,8 @@ class TouchWorld:
     parts: dict[str, Int[np.ndarray, "n"]]
     probes: Beliefs
     read: Beliefs
+    readers: tuple[ContactReader, ...]
+    scale: float
 
 
 def make_world(config: WorldConfig, context: Context) -> TouchWorld:
@@ -85,8 +103,16 @@ def make_world(config: WorldConfig, context: Context) -> TouchWorld:
         label=jnp.asarray(made.label, jnp.int32),
         choices=tuple(TouchChoice(sensor=s, motion=m, force_n=f) for s, m, f in contacts.choices),
     )
-    probes, read = Beliefs(found["probes"], made.label), Beliefs(found["read"], made.label)
-    return TouchWorld(config=config, contacts=made, bank=bank, parts=parts, probes=probes, read=read)
+    return TouchWorld(
+        config=config,
+        contacts=made,
+        bank=bank,
+        parts=parts,
+        probes=Beliefs(found["probes"], made.label),
+        read=Beliefs(found["read"], made.label),
+        readers=restored(found),
+        scale=belief_scale(found["read"]),
+    )
 
 
 def _encoded(
@@ -97,8 +123,28 @@ def _encoded(
     features, statistics = contact_features(made, context), contact_statistics(made, context)
     with context.timed("probes"):
         probes = crossed(lambda learned, _: probe_beliefs(features, made.label, learned, context), fitted)
+    readers: list[ContactReader] = []
+
+    def read(learned: Int[np.ndarray, "m"], k: int) -> Float[np.ndarray, "O C A K"]:
+        readers.append(train_reader(config.encoder, statistics, made.label, learned, context, k))
+        choice = np.arange(statistics.shape[1], dtype=np.int32)
+        return np.stack([read_contacts(config.encoder, readers[-1], of_object, choice) for of_object in statistics])
+
     with context.timed("encoder"):
-        read = lambda learned, k: encoder_beliefs(config.encoder, statistics, made.label, learned, context, k)
         encoder = crossed(read, fitted)
     both = np.asarray(jax.nn.log_softmax((encoder + probes) / 2))
-    return {"tokens": belief_tokens(both), "read": both, "encoder": encoder, "probes": probes}
+    tokens = belief_tokens(both, belief_scale(both))
+    return {"tokens": tokens, "read": both, "encoder": encoder, "probes": probes} | stored(readers)
+
+
+def stored(readers: Sequence[ContactReader]) -> dict[str, np.ndarray]:
+    """Readers as arrays by name."""
+    parts = {str(k): {"params": r.params, "centre": r.centre, "spread": r.spread} for k, r in enumerate(readers)}
+    return {f"{READERS}/{name}": np.asarray(x) for name, x in traverse_util.flatten_dict(parts, sep="/").items()}
+
+
+def restored(arrays: Mapping[str, np.ndarray]) -> tuple[ContactReader, ...]:
+    """Readers from the arrays of `stored`; others are ignored."""
+    own = {name: x for name, x in arrays.items() if name.startswith(f"{READERS}/")}
+    parts = traverse_util.unflatten_dict(own, sep="/")[READERS]
+    return tuple(ContactReader(**parts[str(k)]) for k in range(len(parts)))

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import json
+import sys
 import threading
 import webbrowser
 from collections.abc import Iterator, Sequence
@@ -12,8 +13,10 @@ from typing import Annotated, Literal
 import numpy as np
 import tyro
 
+from experiments.active.saved import read_explorer
 from experiments.ask.answers import answer_json, as_json, ask_policy, count_right, text_lines
 from experiments.ask.demo import demo_server
+from experiments.ask.exploring import exploration_lines, explored, explorer_folder
 from experiments.ask.inputs import read_contacts, read_touch
 from experiments.ask.page import write_page
 from experiments.core.artifacts import DamagedFileError
@@ -50,7 +53,8 @@ class AskCommand(Places):
 
     POLICY is a run, RUN/ARM, RUN/ARM/SEED, a policy's folder, hub:USER/NAME, or the name of one that comes with the
     package, which is taken where none is given.  INPUT is `generated`, `generated:NUMBER`, `generated:soft,wood`,
-    RECORDS, RECORDS:CONTACT, a video, or a folder of pictures; two INPUTs are compared.
+    RECORDS, RECORDS:CONTACT, a video, or a folder of pictures; two INPUTs are compared.  A policy of `active_touch`
+    asks for each touch itself: INPUT is `generated`, `generated:NUMBER`, or left out, and you answer with recordings.
     """
 
     names: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[POLICY] INPUT [INPUT]")]
@@ -69,6 +73,10 @@ class AskCommand(Places):
         """Ask, print, and return the exit status."""
         given = list(self.names)
         policy = given.pop(0) if given and is_policy(given[0], self.runs_dir) else ""
+        folder = explorer_folder(policy, self.runs_dir) if policy else None
+        if folder is not None:
+            print_lines(*self._explored(folder, given))
+            return 0
         if not policy and len(given) > 1 and not _is_input(given[0]):
             policy = given.pop(0)  # names neither: the error says what a policy can be
         if len(given) not in (1, 2) or (self.every and len(given) != 1):
@@ -83,6 +91,18 @@ class AskCommand(Places):
         if self.html is not None:
             write_page(self.html, answered)
         return 0
+
+    def _explored(self, folder: Path, given: list[str]) -> Iterator[str]:
+        """The dialogue of a policy that chooses its touches, and its answer."""
+        if len(given) > 1 or self.every or self.html is not None or self.json or self.sensor or not self.question:
+            raise DataError(
+                f"names are {self.names}: a policy that chooses its touches takes --question, at most one INPUT, and "
+                "none of --sensor, --every, --json and --html; correct them"
+            )
+        explorer = read_explorer(folder)
+        source = given[0] if given else ""
+        found = explored(explorer, source, self.question, print_lines, sys.stdin.readline)
+        yield from exploration_lines(explorer, found, self.question)
 
     def _every(self, policy: AskablePolicy, path: Path) -> Iterator[str]:
         """The answers about every contact as JSON lines, or the share of right ones by attribute."""

@@ -119,13 +119,23 @@ def _generated(which: str, saved: SavedPolicy) -> AskedTouch:
 
 def _recorded(path: Path, which: str, saved: SavedPolicy) -> AskedTouch:
     store = RecordStore(path)
+    row = contact_row(store, which)
+    return _of_contact(store, row, saved, f"contact {row} of {path}")
+
+
+def contact_row(store: RecordStore, which: str) -> int:
+    """The first contact with this number or of this object, of all if `which` is empty.
+
+    Raises:
+      DataError: there is none.
+    """
     rows = [i for i, key in enumerate(store.contacts) if which in ("", str(i), key.object_id)]
     if not rows:
         raise DataError(
-            f"input is {path}:{which}: must name a contact 0..{len(store) - 1} or an object; "
-            f"`python -m sensors_io list {path}` shows them"
+            f"input is {store.path}:{which}: must name a contact 0..{len(store) - 1} or an object; "
+            f"`python -m sensors_io list {store.path}` shows them"
         )
-    return _of_contact(store, rows[0], saved, f"contact {rows[0]} of {path}")
+    return rows[0]
 
 
 def _of_contact(store: RecordStore | LiveScenes, i: int, saved: SavedPolicy, name: str) -> AskedTouch:
@@ -136,9 +146,23 @@ def _of_contact(store: RecordStore | LiveScenes, i: int, saved: SavedPolicy, nam
 
 def _filmed(path: Path, saved: SavedPolicy, sensor: str) -> AskedTouch:
     """A video, or a folder of pictures, of one sensor."""
-    keep, named = Keep(), sensor or saved.sensors[0]
+    named = sensor or saved.sensors[0]
     if named not in saved.sensors:
         raise DataError(f"sensor is {named!r}: the policy reads {', '.join(saved.sensors)}; choose one of them")
+    sequence = filmed_sequence(path, named)
+    card = ObjectCard(object_id=sequence.key.object_id, split="unlabelled", labels={}, annotator="")
+    asked = _asked({named: sequence}, card, saved, str(path))
+    remark = () if sensor else (f"read as pictures of {named}; --sensor names another",)
+    return dataclasses.replace(asked, remarks=(*remark, *asked.remarks))
+
+
+def filmed_sequence(path: Path, sensor: str) -> TouchSequence:
+    """A video, or a folder of pictures, as the sequence of a sensor.
+
+    Raises:
+      DataError: neither, or one that cannot be read.
+    """
+    keep = Keep()
     arrays: dict[str, Any]
     try:
         if path.is_dir():
@@ -156,11 +180,7 @@ def _filmed(path: Path, saved: SavedPolicy, sensor: str) -> AskedTouch:
         raise DataError(f"input is {path}: {error}; give a video, a folder of pictures or of records") from error
     name = re.sub(r"[^A-Za-z0-9]+", "-", path.stem).strip("-") or "object"
     key = ContactKey(object_id=name, site=0, motion="free", trial=0)
-    sequence = film(key, named, host_time_ns=nominal_ns(index, rate_hz), **arrays)
-    card = ObjectCard(object_id=name, split="unlabelled", labels={}, annotator="")
-    asked = _asked({named: sequence}, card, saved, str(path))
-    remark = () if sensor else (f"read as pictures of {named}; --sensor names another",)
-    return dataclasses.replace(asked, remarks=(*remark, *asked.remarks))
+    return film(key, sensor, host_time_ns=nominal_ns(index, rate_hz), **arrays)
 
 
 def _asked(contact: Mapping[str, TouchSequence], card: ObjectCard, saved: SavedPolicy, name: str) -> AskedTouch:

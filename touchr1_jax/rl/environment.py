@@ -51,16 +51,17 @@ class Environment(Protocol):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TouchChoice:
-    """One way to touch an object: a sensor, a motion and a normal force in newtons."""
+    """One way to touch an object: a sensor, a motion and a normal force in newtons, where it is known."""
 
     sensor: str
     motion: str
-    force_n: float
+    force_n: float | None
 
     @property
     def words(self) -> str:
         """The words that choose it, "tac3d slide 5n"."""
-        return f"{self.sensor} {self.motion} {self.force_n:g}n".lower()
+        force = "" if self.force_n is None else f" {self.force_n:g}n"
+        return f"{self.sensor} {self.motion}{force}".lower()
 
 
 class TouchCase(NamedTuple):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from experiments.active.encoder import belief_tokens
+from experiments.active.encoder import belief_scale, belief_tokens
 from experiments.active.probes import PROBE, crossed
 
 OBJECTS, CHOICES, LEVELS = 9, 2, 3
@@ -29,7 +29,7 @@ def test_no_object_is_read_by_a_reader_that_learned_from_it():
 
 def test_tokens_name_their_property_and_keep_differences_of_log_probabilities():
     log_probs = np.log(np.random.default_rng(0).dirichlet(np.ones(LEVELS), (4, CHOICES, 5)))
-    tokens = belief_tokens(log_probs)
+    tokens = belief_tokens(log_probs, belief_scale(log_probs))
     assert tokens.shape == (4, CHOICES, 5, 5 + LEVELS)
     np.testing.assert_array_equal(tokens[1, 0, :, :5], np.eye(5))
     ratio = np.diff(tokens[..., 5:]) / np.diff(log_probs)

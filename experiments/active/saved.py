@@ -1,0 +1,203 @@
+"""A trained policy that chooses its touches, with the readers of its contacts, as a folder.
+
+DIR/config.json         choices, sizes, what is kept of a contact, most contacts of a trajectory, checksum
+DIR/model.safetensors   parameters of the policy and of the readers
+
+A saved policy observes beliefs of the readers alone: the probes that were averaged with them in training are not kept.
+"""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import traverse_util
+from jaxtyping import Float, UInt8
+
+from experiments.active.contacts import PROPERTIES, ContactsConfig
+from experiments.active.encoder import ContactEncoderConfig, belief_tokens, patch_statistics, read_contacts
+from experiments.active.plans import NO_CHOICE
+from experiments.active.policies import answerer, explore
+from experiments.active.world import TouchWorld, restored, stored
+from experiments.core.artifacts import DamagedFileError, jsonable, read_json, write_sealed
+from experiments.study.policies import POLICIES
+from touchr1_jax.models.active_policy import ActivePolicy, build_active_policy
+from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.models.qwen.config import CONFIG_FILE
+from touchr1_jax.models.qwen.safetensors import read_header, read_tensor, write_file
+from touchr1_jax.models.qwen.weights import SINGLE
+from touchr1_jax.models.saved_policy import PolicyError
+from touchr1_jax.rl.environment import TouchBank, TouchChoice
+from touchr1_jax.text.language import EXPLORED_ATTRIBUTES
+from touchr1_jax.types import Params
+
+FORMAT, VERSION = "touchr1-explorer", 1
+
+Give = Callable[[int], UInt8[np.ndarray, "F H W 3"] | None]
+"""Number of a choice → kept frames of that contact; `None` where it cannot be made."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Explorer:
+    """A policy that chooses its touches, and all that it takes to make tokens of a new contact.
+
+    Attributes:
+      policy, params: what chooses and answers.
+      contacts: choices, and what is kept of a contact.
+      encoder, readers, scale: beliefs about a contact, and their standard deviation in training.
+      budget: most contacts of a trajectory.
+    """
+
+    policy: ActivePolicy
+    params: Params
+    contacts: ContactsConfig
+    encoder: ContactEncoderConfig
+    readers: tuple[Any, ...]
+    scale: float
+    budget: int
+
+    def tokens(self, choice: int, frames: UInt8[np.ndarray, "F H W 3"]) -> Float[np.ndarray, "A W"]:
+        """What the policy observes of a contact."""
+        statistics, which = np.asarray(patch_statistics(frames[None])), np.array([choice], np.int32)
+        read = np.mean([read_contacts(self.encoder, r, statistics, which)[0] for r in self.readers], 0)
+        return belief_tokens(np.asarray(jax.nn.log_softmax(read)), self.scale)
+
+    def ask(self, question: int, give: Give) -> "Exploration":
+        """Ask for one contact after the other until the policy concludes; a contact without frames is not observed.
+
+        The policy is greedy, so that a trajectory that goes on repeats its beginning.
+        """
+        shape = (1, len(self.contacts.choices))
+        tokens = np.zeros((*shape, len(PROPERTIES), len(PROPERTIES) + self._levels), np.float32)
+        made, felt = np.zeros(shape, bool), np.zeros(shape, bool)
+        while True:
+            bank = self._bank(tokens, felt)
+            chosen = explore(self.policy, self.params, bank, np.zeros(1, int), self.budget).choices[0, question]
+            new = [int(c) for c in chosen if c != NO_CHOICE and not made[0, c]]
+            if not new:
+                break
+            made[0, new[0]], frames = True, give(new[0])
+            if frames is not None:
+                tokens[0, new[0]], felt[0, new[0]] = self.tokens(new[0], frames), True
+        answer = answerer(self.policy, self.params, bank)
+        level = np.exp(answer(np.zeros(1, int), np.array([question]), chosen[None]))[0]
+        return Exploration(tuple(int(c) for c in chosen if c != NO_CHOICE), level / level.sum())
+
+    @property
+    def _levels(self) -> int:
+        return len(EXPLORED_ATTRIBUTES[0].levels)
+
+    def _bank(self, tokens: np.ndarray, felt: np.ndarray) -> TouchBank:
+        """The contacts of the object so far."""
+        return TouchBank(
+            tokens=jnp.asarray(tokens),
+            available=jnp.asarray(felt),
+            seconds=jnp.asarray(self.contacts.seconds)[None],
+            harm=jnp.zeros(felt.shape),
+            label=jnp.zeros((1, len(PROPERTIES)), jnp.int32),
+            choices=touch_choices(self.contacts),
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Exploration:
+    """The choices that a policy made, in order, and its probabilities of the levels."""
+
+    choices: tuple[int, ...]
+    probabilities: Float[np.ndarray, "K"]
+
+
+def touch_choices(contacts: ContactsConfig) -> tuple[TouchChoice, ...]:
+    """The choices of a configuration as actions."""
+    return tuple(TouchChoice(sensor=s, motion=m, force_n=f) for s, m, f in contacts.choices)
+
+
+def publish(
+    world: TouchWorld, policy: ActivePolicy, params: Params, budget: int, name: str, seed: int, run: Path
+) -> None:
+    """Save a policy of a run where `ask` finds it."""
+    explorer = Explorer(
+        policy=policy,
+        params=params,
+        contacts=world.config.contacts,
+        encoder=world.config.encoder,
+        readers=world.readers,
+        scale=world.scale,
+        budget=budget,
+    )
+    save_explorer(run / POLICIES / name / str(seed), explorer)
+
+
+def save_explorer(folder: Path, explorer: Explorer) -> None:
+    """Write a policy; one that is there is replaced, `config.json` last."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / CONFIG_FILE).unlink(missing_ok=True)
+    flat = traverse_util.flatten_dict({"policy": explorer.params}, sep="/")
+    arrays = {name: np.asarray(x, np.float32) for name, x in flat.items()} | {
+        name: np.asarray(x, np.float32) for name, x in stored(explorer.readers).items()
+    }
+    write_file(folder / SINGLE, arrays)
+    decoder = explorer.policy.fns.module.config.decoder
+    fields: Mapping[str, Any] = {
+        "model_type": FORMAT,
+        "version": VERSION,
+        "decoder": dataclasses.asdict(decoder),
+        "contacts": dataclasses.asdict(explorer.contacts),
+        "encoder": {"width": explorer.encoder.width, "layers": explorer.encoder.layers},
+        "scale": explorer.scale,
+        "budget": explorer.budget,
+        "sha256": hashlib.sha256((folder / SINGLE).read_bytes()).hexdigest(),
+    }
+    write_sealed(folder / CONFIG_FILE, jsonable(fields))
+
+
+def is_explorer(folder: Path) -> bool:
+    """True for a folder that `save_explorer` wrote."""
+    try:
+        found = json.loads((folder / CONFIG_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(found, dict) and found.get("model_type") == FORMAT
+
+
+def read_explorer(folder: Path) -> Explorer:
+    """The policy of a folder that `save_explorer` wrote.
+
+    Raises:
+      PolicyError: damaged, of another version, or of other sizes than this version makes.
+    """
+    try:
+        found = read_json(folder / CONFIG_FILE)
+        if found["version"] != VERSION:
+            raise PolicyError(f"policy is {folder}: version is {found['version']}: must be {VERSION}; train it anew")
+        if hashlib.sha256((folder / SINGLE).read_bytes()).hexdigest() != found["sha256"]:
+            raise PolicyError(f"policy is {folder}: {SINGLE} was changed after it was written; copy the folder again")
+        contacts = ContactsConfig(**_tuples(found["contacts"]))
+        policy = build_active_policy(
+            tuple(choice.words for choice in touch_choices(contacts)),
+            dataclasses.replace(DecoderConfig(**_tuples(found["decoder"])), vocab_size=0),
+        )
+        arrays = {name: read_tensor(entry) for name, entry in read_header(folder / SINGLE).items()}
+        tree = traverse_util.unflatten_dict(arrays, sep="/")
+        return Explorer(
+            policy=policy,
+            params=jax.tree.map(jnp.asarray, tree["policy"]),
+            contacts=contacts,
+            encoder=ContactEncoderConfig(**found["encoder"]),
+            readers=restored(arrays),
+            scale=float(found["scale"]),
+            budget=int(found["budget"]),
+        )
+    except (DamagedFileError, OSError, ValueError, TypeError, LookupError) as error:
+        if isinstance(error, PolicyError):
+            raise
+        raise PolicyError(f"policy is {folder}: cannot be read ({error}); copy the folder again") from error
+
+
+def _tuples(fields: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: tuple(x) if isinstance(x, list) else x for name, x in fields.items()}
