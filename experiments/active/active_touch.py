@@ -38,6 +38,7 @@ from experiments.active.arms import (
     LearnerConfig,
     at_seconds,
     beliefs_of,
+    check_arms,
     controls,
     counted,
     every_touch,
@@ -54,7 +55,7 @@ from experiments.active.findings import findings
 from experiments.active.headroom import headroom
 from experiments.active.plans import Played
 from experiments.active.report import headroom_table
-from experiments.active.videos import VideosConfig, stopping
+from experiments.active.videos import StoppingConfig, stopping
 from experiments.active.world import TouchWorld, WorldConfig, make_world
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
@@ -92,7 +93,7 @@ class ActiveTouchConfig:
     seeds: int = 5
     full_seeds: int = 1
     physiclear: Path | None = None
-    videos: VideosConfig = VideosConfig()
+    videos: StoppingConfig = StoppingConfig()
     agents: bool = False
     agent: AgentConfig = AgentConfig()
 
@@ -124,6 +125,7 @@ def run(config: ActiveTouchConfig, context: Context) -> Results:
     real = None if config.physiclear is None else stopping(config.videos, config.physiclear, context)
     world = make_world(config.world, context)
     policy = make_policy(world, config.learner)
+    check_arms(world, policy, config.arms(0))
     tables = [_headroom(world, config, context)]
     seeds: list[Mapping[str, Played]] = []
     for seed in context.each("seeds", range(config.seeds)):

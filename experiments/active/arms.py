@@ -30,6 +30,7 @@ from touchr1_jax.models.active_policy import ActivePolicy, build_active_policy
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.rl.config import GRPOConfig, Norm, Paper
 from touchr1_jax.rl.touch_reward import Prices
+from touchr1_jax.training.exploration import check_exploration, touch_batch_of
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import OptimizerConfig
 from touchr1_jax.training.train_sft import SFTConfig
@@ -109,6 +110,19 @@ class SeedPolicy:
 def make_policy(world: TouchWorld, config: LearnerConfig) -> ActivePolicy:
     """The policy that speaks of the choices of a world."""
     return build_active_policy(world.bank.actions, config.decoder)
+
+
+def check_arms(world: TouchWorld, policy: ActivePolicy, arms: Mapping[str, Arm]) -> None:
+    """Try every arm's budget and prices on the objects of reinforcement before anything is trained.
+
+    Raises:
+      EnvironmentCheckError, RewardError: as `train_active`.
+    """
+    bank = part_of(world.bank, world.parts["reinforced"])
+    nothing = np.zeros(0, int)
+    for arm in arms.values():
+        every = touch_batch_of(policy, bank, nothing, nothing)  # of a bank all questions are tried
+        check_exploration(policy, bank, every, prices=arm.prices, budget=arm.budget)
 
 
 def warm_start(

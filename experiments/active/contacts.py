@@ -73,6 +73,11 @@ class ContactsConfig:
                 )
         if not self.forces_n or min(self.forces_n) <= 0 or len(set(self.forces_n)) != len(self.forces_n):
             raise ConfigurationError(f"forces_n is {self.forces_n}: must be different forces above 0 N; correct it")
+        if len(self.choices) < 2:
+            raise ConfigurationError(
+                f"motions × forces_n × sensors are {self.choices}: must be at least 2, or there is nothing to choose; "
+                "add some"
+            )
         if self.picture_px % 8 or self.picture_px < 16:
             raise ConfigurationError(
                 f"picture_px is {self.picture_px}: must be a multiple of 8 and at least 16, for statistics of "

@@ -20,7 +20,13 @@ from flax import traverse_util
 from jaxtyping import Float, UInt8
 
 from experiments.active.contacts import PROPERTIES, ContactsConfig
-from experiments.active.encoder import ContactEncoderConfig, belief_tokens, patch_statistics, read_contacts
+from experiments.active.encoder import (
+    ContactEncoderConfig,
+    ContactReader,
+    belief_tokens,
+    patch_statistics,
+    read_contacts,
+)
 from experiments.active.plans import NO_CHOICE
 from experiments.active.policies import answerer, explore
 from experiments.active.world import TouchWorld, restored, stored
@@ -57,7 +63,7 @@ class Explorer:
     params: Params
     contacts: ContactsConfig
     encoder: ContactEncoderConfig
-    readers: tuple[Any, ...]
+    readers: tuple[ContactReader, ...]
     scale: float
     budget: int
 

@@ -44,7 +44,7 @@ READERS = KernelProbeConfig(families=tuple(dict.fromkeys(families())))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class VideosConfig:
+class StoppingConfig:
     """Folds and training of the policies that stop.
 
     Args:
@@ -110,7 +110,7 @@ class VideoWorld:
     fold: Int[np.ndarray, "n"]
 
 
-def read_videos(config: VideosConfig, source: Path, context: Context) -> VideoWorld:
+def read_videos(config: StoppingConfig, source: Path, context: Context) -> VideoWorld:
     """The labelled objects of PhysiCLeAR's layout that have enough videos.
 
     Raises:
@@ -119,7 +119,7 @@ def read_videos(config: VideosConfig, source: Path, context: Context) -> VideoWo
     return world_of(config, describe_source(source, config.frames, context).labelled())
 
 
-def world_of(config: VideosConfig, videos: DescribedVideos) -> VideoWorld:
+def world_of(config: StoppingConfig, videos: DescribedVideos) -> VideoWorld:
     """Videos by object, in an order drawn by the seed."""
     names, count = np.unique(videos.objects, return_counts=True)
     names = names[count >= config.videos]
@@ -149,7 +149,7 @@ def bank_of(world: VideoWorld, tested: Int[np.ndarray, "n"], seed: int) -> Touch
     )
 
 
-def stopping(config: VideosConfig, source: Path, context: Context) -> tuple[Table, Picture]:
+def stopping(config: StoppingConfig, source: Path, context: Context) -> tuple[Table, Picture]:
     """Accuracy against the number of videos: policies, a random number, so many for all, thresholds on belief."""
     world = read_videos(config, source, context)
     folds: list[Mapping[str, Played]] = []
@@ -161,7 +161,7 @@ def stopping(config: VideosConfig, source: Path, context: Context) -> tuple[Tabl
     return video_table(world, played), video_picture(config, played)
 
 
-def _fold(config: VideosConfig, world: VideoWorld, k: int, context: Context) -> dict[str, Any]:
+def _fold(config: StoppingConfig, world: VideoWorld, k: int, context: Context) -> dict[str, Any]:
     """Outcomes of policies and controls about the objects of one fold, as JSON."""
     tested, known = np.flatnonzero(world.fold == k), np.flatnonzero(world.fold != k)
     bank = bank_of(world, tested, config.seed)
@@ -204,7 +204,7 @@ def _explored(
 
 
 def controls_of(
-    config: VideosConfig, bank: TouchBank, tested: Int[np.ndarray, "n"], answer: Answer, rng: np.random.Generator
+    config: StoppingConfig, bank: TouchBank, tested: Int[np.ndarray, "n"], answer: Answer, rng: np.random.Generator
 ) -> dict[str, Played]:
     """So many videos for all, a random number of them, and as many as a threshold on belief asks for."""
     n, questions, videos = len(tested), bank.label.shape[1], config.videos
@@ -271,7 +271,7 @@ def video_table(world: VideoWorld, played: Mapping[str, Played]) -> Table:
     )
 
 
-def video_picture(config: VideosConfig, played: Mapping[str, Played]) -> Picture:
+def video_picture(config: StoppingConfig, played: Mapping[str, Played]) -> Picture:
     """Accuracy over the mean number of videos."""
     groups = {
         "so many for all": [f"{k} videos" for k in range(config.videos + 1)],

@@ -16,7 +16,7 @@ import tyro
 from experiments.active.saved import read_explorer
 from experiments.ask.answers import answer_json, as_json, ask_policy, count_right, text_lines
 from experiments.ask.demo import demo_server
-from experiments.ask.exploring import exploration_lines, explored, explorer_folder
+from experiments.ask.exploring import explored, explorer_folder
 from experiments.ask.inputs import read_contacts, read_touch
 from experiments.ask.page import write_page
 from experiments.core.artifacts import DamagedFileError
@@ -75,7 +75,7 @@ class AskCommand(Places):
         policy = given.pop(0) if given and is_policy(given[0], self.runs_dir) else ""
         folder = explorer_folder(policy, self.runs_dir) if policy else None
         if folder is not None:
-            print_lines(*self._explored(folder, given))
+            print_lines(self._explored(folder, given))
             return 0
         if not policy and len(given) > 1 and not _is_input(given[0]):
             policy = given.pop(0)  # names neither: the error says what a policy can be
@@ -92,17 +92,16 @@ class AskCommand(Places):
             write_page(self.html, answered)
         return 0
 
-    def _explored(self, folder: Path, given: list[str]) -> Iterator[str]:
-        """The dialogue of a policy that chooses its touches, and its answer."""
+    def _explored(self, folder: Path, given: list[str]) -> str:
+        """The answer of a policy that chooses its touches, after it asked for each of them."""
         if len(given) > 1 or self.every or self.html is not None or self.json or self.sensor or not self.question:
             raise DataError(
                 f"names are {self.names}: a policy that chooses its touches takes --question, at most one INPUT, and "
                 "none of --sensor, --every, --json and --html; correct them"
             )
-        explorer = read_explorer(folder)
-        source = given[0] if given else ""
-        found = explored(explorer, source, self.question, print_lines, sys.stdin.readline)
-        yield from exploration_lines(explorer, found, self.question)
+        return explored(
+            read_explorer(folder), given[0] if given else "", self.question, print_lines, sys.stdin.readline
+        )
 
     def _every(self, policy: AskablePolicy, path: Path) -> Iterator[str]:
         """The answers about every contact as JSON lines, or the share of right ones by attribute."""

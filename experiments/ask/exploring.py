@@ -51,8 +51,8 @@ def explorer_folder(name: str, runs_dir: Path) -> Path | None:
 
 def explored(
     explorer: Explorer, source: str, question: str, say: Callable[[str], None], listen: Callable[[], str]
-) -> Exploration:
-    """Answer a question about one object by the contacts that the policy asks for.
+) -> str:
+    """Answer a question about one object by the contacts that the policy asks for; the answer as text.
 
     Args:
       explorer: the policy.
@@ -68,14 +68,17 @@ def explored(
     asked = read_question(question, WORDS)
     if asked.compares:
         raise DataError(f"question is {question!r}: it compares two objects; ask about one")
-    give = _generated(explorer.contacts, source) if source else _person(explorer.contacts, say, listen)
+    contacts = unseen_object(explorer.contacts, source) if source else explorer.contacts
+    give = _generated(contacts) if source else _person(contacts, say, listen)
 
     def contact(choice: int) -> Any:
         say(f"now {request(explorer.contacts.choices[choice])}")
         return give(choice)
 
     with compiled_quickly():  # programs that run a few times
-        return explorer.ask(list(WORDS).index(asked.name), contact)
+        found = explorer.ask(list(WORDS).index(asked.name), contact)
+    truth = WORDS[asked.name][solid_of(contacts.scenes, 0).levels()[asked.name]] if source else ""
+    return exploration_line(explorer, found, question, truth)
 
 
 def request(choice: tuple[str, str, float]) -> str:
@@ -84,10 +87,9 @@ def request(choice: tuple[str, str, float]) -> str:
     return f"{SAID[motion]} with the {sensor}, {force:g} N"
 
 
-def _generated(contacts: ContactsConfig, source: str) -> Callable[[int], np.ndarray]:
-    """Contacts of a generated object that no training saw."""
-    config = unseen_object(contacts, source)
-    return lambda choice: kept_frames(one_contact(config, 0, contacts.choices[choice]), contacts)
+def _generated(contacts: ContactsConfig) -> Callable[[int], np.ndarray]:
+    """Contacts of the only object of a configuration."""
+    return lambda choice: kept_frames(one_contact(contacts, 0, contacts.choices[choice]), contacts)
 
 
 def unseen_object(contacts: ContactsConfig, source: str) -> ContactsConfig:
@@ -104,12 +106,6 @@ def unseen_object(contacts: ContactsConfig, source: str) -> ContactsConfig:
         )
     drawn = int(number) if number else int(np.random.default_rng().integers(UNSEEN_SEED))
     return dataclasses.replace(contacts, objects=1, seed=UNSEEN_SEED + drawn)
-
-
-def truth_of(contacts: ContactsConfig, question: str) -> str:
-    """The true level of the only object of a configuration, in words."""
-    name = read_question(question, WORDS).name
-    return WORDS[name][solid_of(contacts.scenes, 0).levels()[name]]
 
 
 def _person(
@@ -150,10 +146,11 @@ def recording(source: str, sensor: str) -> Sequence:
     return found[sensor]
 
 
-def exploration_lines(explorer: Explorer, found: Exploration, question: str) -> list[str]:
-    """The answer as text."""
+def exploration_line(explorer: Explorer, found: Exploration, question: str, truth: str = "") -> str:
+    """The answer as text, with the truth where it is known."""
     words = WORDS[read_question(question, WORDS).name]
     shares = ", ".join(f"{word} {p:.0%}" for word, p in zip(words, found.probabilities, strict=True))
     number = f"{len(found.choices)} touch{'' if len(found.choices) == 1 else 'es'}"
     seconds = explorer.contacts.seconds[list(found.choices)].sum()
-    return [f"{question} {words[int(found.probabilities.argmax())]} ({shares}), after {number}, {seconds:.1f} s"]
+    said = f"{question} {words[int(found.probabilities.argmax())]} ({shares}), after {number}, {seconds:.1f} s"
+    return f"{said}; truth {truth}" if truth else said

@@ -1,0 +1,65 @@
+"""What a policy that chooses cannot learn from is named before anything is trained."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments.active.active_touch import ActiveTouchConfig
+from experiments.active.arms import Arm, check_arms
+from experiments.active.contacts import ContactsConfig
+from experiments.core.errors import ConfigurationError
+from tests.touchr1_jax.explored import BANK, POLICY
+from touchr1_jax.rewards import RewardError
+from touchr1_jax.rl.environment import EnvironmentCheckError
+
+WHOLE = jax.tree.map(jnp.asarray, dataclasses.replace(BANK, available=np.ones((4, 2), bool)))
+
+
+def world(**changes):
+    return SimpleNamespace(bank=dataclasses.replace(WHOLE, **changes), parts={"reinforced": np.arange(4)})
+
+
+def test_arms_that_can_learn_pass():
+    check_arms(world(), POLICY, {"chosen": Arm(budget=1), "chosen_2": Arm(budget=2, second=0.01, harm=0.1)})
+
+
+def available(*rows):
+    return jnp.asarray(np.array(rows, bool))
+
+
+CASES = {
+    "touching never pays": ({}, Arm(budget=1, second=9.0), RewardError),
+    "second is nan": ({}, Arm(budget=1, second=float("nan")), RewardError),
+    "budget is 0": ({}, Arm(budget=0), EnvironmentCheckError),
+    "available for no object": ({"available": available(*[(1, 0)] * 4)}, Arm(budget=1), EnvironmentCheckError),
+    "fewer than 2 contacts": (
+        {"available": available((1, 1), (1, 1), (1, 0), (1, 1))},
+        Arm(budget=1),
+        EnvironmentCheckError,
+    ),
+    "seconds of": ({"seconds": jnp.full((4, 2), jnp.nan)}, Arm(budget=1), EnvironmentCheckError),
+}
+
+
+@pytest.mark.parametrize("names", CASES)
+def test_arms_that_cannot_learn_are_named(names):
+    changes, arm, error = CASES[names]
+    with pytest.raises(error, match=names):
+        check_arms(world(**changes), POLICY, {"chosen": arm})
+
+
+def test_contacts_without_a_choice_are_refused_before_they_are_made():
+    with pytest.raises(ConfigurationError, match="nothing to choose"):
+        ContactsConfig(motions=("press",), forces_n=(2.0,), sensors=("tac3d",))
+
+
+def test_agents_that_are_not_installed_are_refused_before_contacts_are_made(monkeypatch):
+    monkeypatch.setattr("experiments.active.agents.missing_packages", lambda: ["stable_baselines3"])
+    with pytest.raises(
+        ConfigurationError, match=r"stable_baselines3 not installed; run pip install 'touchr1-jax\[agents\]'"
+    ):
+        ActiveTouchConfig(agents=True)

@@ -1,0 +1,73 @@
+"""A saved policy asks for contacts until it concludes, and a folder gives back what was saved."""
+
+import json
+
+import numpy as np
+import pytest
+
+from experiments.active.saved import is_explorer, read_explorer, save_explorer
+from tests.experiments.active.explorers import explorer, frames, touching
+from touchr1_jax.models.saved_policy import PolicyError
+
+
+@pytest.fixture(scope="module")
+def asking():
+    return touching()
+
+
+def test_it_asks_for_each_contact_once_and_concludes(asking):
+    one, question = asking
+    requested = []
+
+    def give(choice):
+        requested.append(choice)
+        return frames(choice)
+
+    found = one.ask(question, give)
+    assert 1 <= len(found.choices) <= one.budget
+    assert requested == list(dict.fromkeys(found.choices))
+    assert found.probabilities.sum() == pytest.approx(1)
+
+
+def test_what_is_observed_changes_the_answer_and_nothing_observed_does_not(asking):
+    one, question = asking
+    seen = [one.ask(question, lambda choice, s=s: frames(s)).probabilities for s in range(3)]
+    assert not np.allclose(seen[0], seen[1])
+    unseen = [one.ask(question, lambda choice: None) for _ in range(2)]
+    assert unseen[0].choices == unseen[1].choices
+    np.testing.assert_array_equal(unseen[0].probabilities, unseen[1].probabilities)
+
+
+def test_a_folder_gives_back_the_policy(asking, tmp_path):
+    one, question = asking
+    save_explorer(tmp_path / "policy", one)
+    save_explorer(tmp_path / "policy", one)  # over itself
+    assert is_explorer(tmp_path / "policy")
+    again = read_explorer(tmp_path / "policy").ask(question, frames)
+    found = one.ask(question, frames)
+    assert again.choices == found.choices
+    np.testing.assert_allclose(again.probabilities, found.probabilities, rtol=1e-5)
+
+
+@pytest.mark.parametrize("damage", ["byte", "missing", "version"])
+def test_a_damaged_folder_is_named(tmp_path, damage):
+    folder = tmp_path / "policy"
+    save_explorer(folder, explorer(0))
+    if damage == "byte":
+        content = bytearray((folder / "model.safetensors").read_bytes())
+        content[-5] ^= 1
+        (folder / "model.safetensors").write_bytes(content)
+    elif damage == "missing":
+        (folder / "model.safetensors").unlink()
+    else:
+        fields = json.loads((folder / "config.json").read_text())
+        del fields["crc32"]
+        (folder / "config.json").write_text(json.dumps(fields | {"version": 99}))
+    with pytest.raises(PolicyError, match=str(folder)):
+        read_explorer(folder)
+
+
+def test_other_folders_are_no_explorers(tmp_path):
+    assert not is_explorer(tmp_path)
+    (tmp_path / "config.json").write_text("[]")
+    assert not is_explorer(tmp_path)
