@@ -68,7 +68,7 @@ class Explorer:
     budget: int
 
     def tokens(self, choice: int, frames: UInt8[np.ndarray, "F H W 3"]) -> Float[np.ndarray, "A W"]:
-        """What the policy observes of a contact."""
+        """Observation of a contact, one token a property."""
         statistics, which = np.asarray(patch_statistics(frames[None])), np.array([choice], np.int32)
         read = np.mean([read_contacts(self.encoder, r, statistics, which)[0] for r in self.readers], 0)
         return belief_tokens(np.asarray(jax.nn.log_softmax(read)), self.scale)

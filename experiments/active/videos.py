@@ -199,7 +199,7 @@ def _fold(config: StoppingConfig, world: VideoWorld, k: int, context: Context) -
 def _explored(
     policy: ActivePolicy, params: Any, bank: TouchBank, tested: np.ndarray, budget: int, answer: Answer
 ) -> Played:
-    """What the policy touches, answered by the warm start as the controls are."""
+    """Touches of a policy, answered by the warm start as the controls are."""
     return play(bank, tested, explore(policy, params, bank, tested, budget).choices, answer)
 
 

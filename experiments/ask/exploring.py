@@ -129,7 +129,7 @@ def _person(
 
 
 def recording(source: str, sensor: str) -> Sequence:
-    """What one sensor recorded of a contact.
+    """Recording of a contact by one sensor.
 
     Raises:
       DataError: no such recording, or one by other sensors.
