@@ -1,4 +1,4 @@
-"""What a policy that chooses cannot learn from is named before anything is trained."""
+"""Settings from which a policy that chooses cannot learn are named before anything is trained."""
 
 import dataclasses
 from types import SimpleNamespace
