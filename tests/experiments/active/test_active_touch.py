@@ -41,6 +41,13 @@ def test_a_shrunken_run_scores_every_plan_at_equal_seconds(tmp_path):
     assert seconds["random_2"] == pytest.approx(2 * seconds["random"])
     assert seconds["chosen"] <= seconds["random"] + 1e-6
     assert np.isfinite([row[1] for row in every["rows"]]).all()
+    programs = next(r for r in results["requirements"] if r["name"] == "programs of the step on turns")
+    assert programs["measured"] == 1
+    agents = next(t for t in results["tables"] if t["title"] == "Agents of other libraries")
+    assert agents["rows"][0][1].startswith("not run: ")
+    assert {*(directory / "policies").glob("*/0")} == {
+        directory / "policies" / name / "0" for name in ("chosen", "chosen_2", "chosen_harm")
+    }
 
 
 @pytest.mark.parametrize("field", ["seeds", "full_seeds", "contacts"])
