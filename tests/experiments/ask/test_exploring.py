@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from experiments.__main__ import main
 from experiments.active.saved import save_explorer
+from experiments.ask.command import run_asking
 from experiments.ask.exploring import request, unseen_object
 from experiments.core.errors import DataError
 from tests.experiments.active.explorers import CONTACTS, touching
@@ -25,7 +25,7 @@ def saved(tmp_path_factory):
 
 def ask(saved, home, *arguments):
     folder, question = saved
-    return main(["ask", folder, *arguments, "--question", question, "--cache-dir", str(home)])
+    return run_asking(["ask", folder, *arguments, "--question", question, "--cache-dir", str(home)])
 
 
 def test_a_person_answers_with_pictures(saved, tmp_path, monkeypatch, capsys):
