@@ -109,7 +109,9 @@ def test_a_fold_is_played_by_policies_and_controls(monkeypatch, tmp_path):
         grpo=dataclasses.replace(CONFIG.grpo, prompts=6, group=4, micro_prompts=6),
     )
     monkeypatch.setattr(videos, "describe_source", lambda *_: described())
-    table, picture = videos.stopping(config, tmp_path, Context(tmp_path, tmp_path / "cache", Console(quiet=True)))
+    context = Context(tmp_path, tmp_path / "cache", Console(quiet=True))
+    table, picture = videos.stopping(config, tmp_path, context)
+    context.close()
     plans = [row[0] for row in table.rows]
     assert {"chosen at 0.01", "until 0.6", "a random number", "0 videos", "3 videos"} <= set(plans)
     assert picture.content
