@@ -6,6 +6,7 @@ import signal
 import sys
 
 from experiments.core.commands import ASKING, SWEEP, print_error, run_command
+from sensors_io.commands.console import print_in_any_encoding
 
 SIGNALLED = 128
 """Exit statuses above it are those of a run that a signal stopped."""
@@ -29,6 +30,7 @@ def leave(status: int) -> None:
 def main() -> None:
     """Run the command line and end the process."""
     arguments = sys.argv[1:]
+    print_in_any_encoding()
     try:
         if arguments and arguments[0] in ASKING:
             from experiments.ask.command import run_asking

@@ -10,7 +10,8 @@ from typing import Any
 
 import tyro
 
-from sensors_io.commands.console import ERR, OUT, complain
+from sensors_io.commands.console import ERR, OUT, complain, print_in_any_encoding
+from sensors_io.commands.numbers import require_possible
 from sensors_io.errors import UserError
 
 PROG = "python -m sensors_io"
@@ -48,6 +49,7 @@ def main(args: list[str] | None = None) -> int:
       args: the command line; None takes that of the process.
     """
     args = sys.argv[1:] if args is None else args
+    print_in_any_encoding()
     if not args or args[0] in ("-h", "--help"):
         OUT.print("\n".join(usage()), markup=False, highlight=False, soft_wrap=True)
         return 0 if args else 2
@@ -58,7 +60,13 @@ def main(args: list[str] | None = None) -> int:
         ERR.print("\n".join(told), markup=False, highlight=False, soft_wrap=True)
         return 2
     try:
-        return read(args).run()
+        try:
+            command = read(args)
+            require_possible(command)
+        except ValueError as error:  # a configuration refuses its own values
+            complain(error)
+            return 2
+        return command.run()
     except (UserError, OSError) as error:
         complain(error)
         return 1

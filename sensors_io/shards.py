@@ -45,7 +45,7 @@ class ShardWriter:
     def __init__(self, root: pathlib.Path, name: str):
         self._path = root / f"{name}.arrayrecord"
         self._temporary = root / f".{name}.arrayrecord.tmp"
-        self._writer = ArrayRecordWriter(str(self._temporary), _OPTIONS)
+        self._writer = ArrayRecordWriter(_name(self._temporary), _OPTIONS)
         self._count = 0
 
     def write(self, data: bytes) -> int:
@@ -57,7 +57,7 @@ class ShardWriter:
     def publish(self) -> Shard:
         """Close, count, sync and rename the file.  The writer reports no failure of its own: counting finds it."""
         self._writer.close()
-        reader = ArrayRecordReader(str(self._temporary))
+        reader = ArrayRecordReader(_name(self._temporary))
         found = reader.num_records() if reader.ok() else 0
         reader.close()
         if found < self._count:
@@ -75,7 +75,9 @@ class Entries:
         for shard in shards:
             shard.check(root)
         self._files = [(root / shard.file, shard.entries) for shard in shards]
-        paths = [f"{file}[0:{entries}]" for file, entries in self._files]  # the range spares opening each to count it
+        paths = [
+            f"{_name(file)}[0:{entries}]" for file, entries in self._files
+        ]  # the range spares opening each to count it
         self._source = ArrayRecordDataSource(paths) if paths else []
 
     def decode(self, i: int, decode: Callable[[bytes], _T]) -> _T:
@@ -94,3 +96,15 @@ class Entries:
                 return file, i
             i -= entries
         raise IndexError(i)
+
+
+def _name(path: pathlib.Path) -> str:
+    """The path as ArrayRecord takes it.
+
+    Raises:
+      RecordsError: a name of one of its folders is no UTF-8, or of several lines.
+    """
+    name = str(path)
+    if "\n" in name or os.fsencode(name).decode(errors="replace") != name:
+        raise RecordsError(f"{name!r} is no path that records can have: must be one line of UTF-8; rename its folder")
+    return name

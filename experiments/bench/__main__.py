@@ -15,7 +15,7 @@ from rich.table import Table
 from experiments.bench.contacts import measure_split, read_source
 from experiments.core.artifacts import write_json
 from experiments.core.text import number
-from sensors_io.commands.console import complain, progress_bar
+from sensors_io.commands.console import complain, print_in_any_encoding, progress_bar
 from sensors_io.errors import UserError
 from sensors_io.records import RecordStore
 from touchr1_jax.bench.items import ItemError, read_items, write_items
@@ -269,6 +269,7 @@ Command = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command, by default the process's; known errors become one line on stderr and exit status 1."""
+    print_in_any_encoding()
     command = tyro.cli(Command, args=arguments, prog="experiments.bench", config=(tyro.conf.OmitArgPrefixes,))
     try:
         return command.run()

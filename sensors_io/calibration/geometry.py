@@ -183,6 +183,8 @@ def find_pins(picture: np.ndarray, background: np.ndarray, *, rows: int, columns
         raise GeometryError(
             f"picture is {picture.shape}: must be of the background's {background.shape}; take both alike"
         )
+    if min(rows, columns) < 1:
+        raise GeometryError(f"rows and columns are {rows} and {columns}: must be ≥ 1; count the pins of the board")
     change = background.astype(np.float32) - picture.astype(np.float32)
     change = change if change.ndim == 2 else change.mean(-1)
     pitch = min(change.shape[0] / rows, change.shape[1] / columns)

@@ -11,8 +11,8 @@ from rich.table import Table
 from sensors_io import overview, quality
 from sensors_io.commands.console import OUT, complain, progress_bar
 from sensors_io.fields.extract import Extractor
+from sensors_io.fields.sources import read_picture
 from sensors_io.fields.types import Calibration, CalibrationError
-from sensors_io.importers.pictures import read_picture
 from sensors_io.records import CorruptRecordsError, IncompleteRecordsError, RecordsError, RecordStore
 from sensors_io.schema import Flag, SchemaError, Sequence
 

@@ -1,6 +1,8 @@
 """Output shared by all commands: standard output, errors, a progress bar."""
 
 import contextlib
+import io
+import sys
 import time
 from collections.abc import Callable, Iterator
 
@@ -21,6 +23,13 @@ def _console(*, stderr: bool) -> rich.console.Console:
 
 
 OUT, ERR = _console(stderr=False), _console(stderr=True)
+
+
+def print_in_any_encoding() -> None:
+    """Let a terminal or a pipe that cannot show a letter show a question mark instead of ending the program."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a notebook's is another
+            stream.reconfigure(errors="replace")
 
 
 def complain(error: Exception) -> None:

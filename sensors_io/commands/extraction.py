@@ -6,8 +6,8 @@ from collections.abc import Sequence as Seq
 from sensors_io.commands.console import OUT
 from sensors_io.devices.reader import Reader
 from sensors_io.fields.extract import Extractor
+from sensors_io.fields.sources import read_picture
 from sensors_io.fields.types import Calibration
-from sensors_io.importers.pictures import read_picture
 from sensors_io.viewer.presenter import Channel
 
 

@@ -7,7 +7,7 @@ import tyro
 
 from sensors_io.calibration.geometry import find_pins, fit_geometry
 from sensors_io.commands.console import OUT
-from sensors_io.importers.pictures import read_picture
+from sensors_io.fields.sources import read_picture
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

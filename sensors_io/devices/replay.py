@@ -57,8 +57,9 @@ class Faults:
         for name in ("drop_share", "duplicate_share"):
             if not 0 <= getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}: must lie in 0 ≤ {name} < 1; correct it")
-        if self.jitter_s < 0:
-            raise ValueError(f"jitter_s is {self.jitter_s}: must be ≥ 0; correct it")
+        for name in ("jitter_s", "seed"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} is {getattr(self, name)}: must be ≥ 0; correct it")
         ends = [-np.inf, *(d.at_s + d.for_s for d in self.disconnects)]
         if any(d.for_s <= 0 or d.at_s < end for d, end in zip(self.disconnects, ends, strict=False)):
             raise ValueError(f"disconnects is {self.disconnects}: must be ascending and apart; sort them")
@@ -265,6 +266,13 @@ class ReplayConfig:
     contact: int = 0
     seconds: float = 0.0
     faults: Faults = dataclasses.field(default_factory=Faults)
+
+    def __post_init__(self) -> None:
+        if not 0 < self.rate_hz <= NS_PER_S:
+            raise ValueError(f"rate_hz is {self.rate_hz}: must be > 0 and ≤ 10⁹; give the rate of the recording")
+        for name in ("contact", "seconds"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} is {getattr(self, name)}: must be ≥ 0; correct it")
 
     def open(self, clock: Clock | None = None) -> Replay:
         """The device, not open yet."""

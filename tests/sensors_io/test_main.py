@@ -1,6 +1,7 @@
 """The command line: tables for people, exit status 1 and one line for known errors."""
 
 import io
+import os
 import pathlib
 import re
 import shutil
@@ -126,6 +127,75 @@ def test_known_errors_are_one_line(run, tmp_path, monkeypatch, args, message):
     assert len(err.strip().splitlines()) == 1
 
 
+GELSLAM = pathlib.Path(__file__).resolve().parents[1] / "data" / "gelslam"
+REPLAY = ["replay", "--path", str(GELSLAM)]
+BOARD = ["--rows", "7", "--columns", "9", "--pitch-mm", "2", "--out", "o.json"]
+
+
+@pytest.mark.parametrize(
+    ("args", "devices"),
+    [
+        (["check", "records", "--pictures"], []),
+        (["geometry", "board.png", *BOARD], []),
+        (["view", "--port", "0"], REPLAY),
+    ],
+    ids=["check", "geometry", "view"],
+)
+def test_a_picture_that_there_is_not_is_one_line(run, tmp_path, monkeypatch, args, devices):
+    monkeypatch.chdir(tmp_path)
+    fakes.write(tmp_path / "records", 1, sensors=("tac3d",))
+    shutil.copy(GELSLAM / "background.png", "board.png")
+    status, _, err = run(*args, "--background", "nowhere.png", *devices)
+    assert status == 1
+    assert err == "SourceError: nowhere.png is absent: must be a whole picture; replace it\n"
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["extract", "p", "--background", "b", "--out", "o", "--nodes", "0"], "nodes is 0: must be ≥ 4"),
+        (["extract", "p", "--background", "b", "--out", "o", "--mm-per-px", "nan"], "mm_per_px is nan: must be"),
+        (["extract", "p", "--background", "b", "--out", "o", "--smoothing-mm", "inf"], "smoothing_mm is inf: must be"),
+        (["devices", "--tac3d-port", "-1"], "tac3d_port is -1: must lie in 0 … 65535"),
+        (["devices", "--wait-s", "1e300"], "wait_s is 1e+300: must be"),
+        (["view", "--port", "99999", *REPLAY], "port is 99999: must lie in 0 … 65535"),
+        (["view", *REPLAY, "+", "tac3d", "--port", "70000"], "port is 70000: must lie in 0 … 65535"),
+    ],
+)
+def test_a_number_that_nobody_means_is_one_line(run, args, message):
+    status, out, err = run(*args)
+    assert (status, out) == (2, "")
+    assert err.startswith(f"ValueError: {message}")
+    assert len(err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("--rate-hz", "0"), ("--seconds", "-1"), ("--contact", "-1"), ("--seed", "-1")]
+)
+def test_a_replay_refuses_numbers_while_the_command_is_read(run, capsys, option, value):
+    with pytest.raises(SystemExit) as stop:
+        run("view", *REPLAY, option, value)
+    assert stop.value.code == 2
+    assert f"{option[2:].replace('-', '_')} is {value}" in capsys.readouterr().err
+
+
+def test_a_board_of_no_pins_is_one_line(run, tmp_path):
+    picture = GELSLAM / "background.png"
+    for rows, columns in ((0, 9), (7, -1)):
+        numbers = ("--rows", rows, "--columns", columns, "--pitch-mm", "2", "--out", tmp_path / "o.json")
+        status, _, err = run("geometry", picture, "--background", picture, *numbers)
+        assert status == 1
+        assert err.startswith(f"GeometryError: rows and columns are {rows} and {columns}: must be ≥ 1")
+
+
+@pytest.mark.parametrize("program", ["sensors_io", "experiments", "experiments.bench"])
+def test_an_encoding_without_a_letter_ends_no_program(program):
+    order = [sys.executable, "-m", program, "--help"]
+    done = subprocess.run(order, env=os.environ | {"PYTHONIOENCODING": "ascii"}, capture_output=True, check=False)
+    assert done.returncode == 0
+    assert b"?" in done.stdout + done.stderr
+
+
 def test_help_names_every_command_and_a_wrong_one_is_told_the_right_ones(run):
     status, out, _ = run("--help")
     assert status == 0
@@ -162,16 +232,15 @@ def test_an_interrupt_says_how_to_go_on(run, tmp_path, monkeypatch):
 
 def test_check_looks_at_pictures_where_it_can(run, tmp_path):
     """Real presses of a Mini beside their gel at rest; the other sensors' noise has no background and says so."""
-    gelslam = pathlib.Path(__file__).resolve().parents[1] / "data" / "gelslam"
     names = ("background", "press_12", "press_14", "press_18")
-    frames = np.stack([read_picture(gelslam / f"{name}.png") for name in names])
+    frames = np.stack([read_picture(GELSLAM / f"{name}.png") for name in names])
     fakes.write(tmp_path, 1, sensors=("tac3d",))
     with RecordWriter(tmp_path, meta=fakes.META, resume=True) as writer:
         n = len(frames)
         shown = fakes.sequence(0, length=n, trial=1, frames=frames, camera={"recording": {"background": "rest.png"}})
         writer.write_contact([shown])
         writer.write_contact([fakes.sequence(0, trial=2)])
-    shutil.copy(gelslam / "background.png", tmp_path / "rest.png")
+    shutil.copy(GELSLAM / "background.png", tmp_path / "rest.png")
     status, out, _ = run("check", tmp_path, "--pictures")
     assert status == 0
     looked = out[out.index("flags by the pictures") :]

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import os
 import pickle
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import pytest
 from array_record.python.array_record_module import ArrayRecordReader, ArrayRecordWriter
 
 from sensors_io import records
-from sensors_io.records import RecordStore, RecordWriter
+from sensors_io.records import RecordsError, RecordStore, RecordWriter
 from sensors_io.schema import SENSORS, SchemaError
 from tests.sensors_io import fakes
 from tests.sensors_io.checks import refused
@@ -57,6 +58,16 @@ def test_a_data_set_comes_back(tmp_path):
             if want.frames is not None:
                 np.testing.assert_array_equal(got.frames, want.frames)
     np.testing.assert_array_equal(store.objects["object_2"].view, fakes.card(2).view)
+
+
+@pytest.mark.parametrize("name", ["two\nlines", os.fsdecode(b"latin-\xe9")], ids=["lines", "letters"])
+def test_a_folder_that_the_format_cannot_name_is_named(tmp_path, name):
+    """ArrayRecord would end reading with a TypeError."""
+    moved = tmp_path / name
+    refused(RecordsError, "is no path that records can have", fakes.write, moved, 1)
+    fakes.write(tmp_path / "r", 1)
+    shutil.copytree(tmp_path / "r", moved, dirs_exist_ok=True)
+    refused(RecordsError, "rename its folder", lambda: RecordStore(moved).contact(0))
 
 
 def test_splits_are_by_object_and_cover_everything(tmp_path):

@@ -67,8 +67,9 @@ def test_a_far_update_is_shortened_more_than_once(shorten):
     assert far["update_scale"] < 0.9 * np.sqrt(DELTA / far["update_kl"])
 
 
-def test_an_update_of_twice_the_bound_is_shortened(shorten):
-    size = 0.1 * np.sqrt(2 * DELTA / shorten(0.1)[1]["update_kl"])
-    _, twice = shorten(size)
-    assert 1.6 * DELTA < twice["update_kl"] < 2.4 * DELTA
-    assert twice["update_scale"] < 1
+@pytest.mark.parametrize(("kl", "stays"), [(1.3, True), (2.0, False)])
+def test_an_update_is_shortened_from_one_and_a_half_times_the_bound_on(shorten, kl, stays):
+    size = 0.1 * np.sqrt(kl * DELTA / shorten(0.1)[1]["update_kl"])
+    _, found = shorten(size)
+    assert (1.15 if stays else 1.6) * DELTA < found["update_kl"] < (1.45 if stays else 2.4) * DELTA
+    assert (found["update_scale"] == 1) == stays
