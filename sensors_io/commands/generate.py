@@ -7,6 +7,7 @@ from sensors_io import overview
 from sensors_io.commands.console import OUT, progress_bar
 from sensors_io.generate import generate_records
 from sensors_io.records import RecordStore
+from sensors_io.scenes.backend import require_backend
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS
 
@@ -23,6 +24,7 @@ class Generate:
     config: SceneConfig = dataclasses.field(default_factory=SceneConfig)
 
     def run(self) -> int:
+        require_backend()
         each = len(SENSORS) * self.config.frame_count
         with progress_bar("records") as progress:
             generate_records(self.config, self.out, progress=lambda done, total: progress(done * each, total * each))

@@ -196,6 +196,24 @@ def test_an_encoding_without_a_letter_ends_no_program(program):
     assert b"?" in done.stdout + done.stderr
 
 
+def test_a_platform_that_there_is_not_is_one_line(tmp_path):
+    order = [sys.executable, "-m", "sensors_io", "generate", "--out", tmp_path / "r"]
+    environment = os.environ | {"JAX_PLATFORMS": "bogus"}
+    done = subprocess.run(order, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith("BackendError: JAX_PLATFORMS is 'bogus': must name platforms of this machine")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_a_full_disk_behind_the_output_is_one_line():
+    order = [sys.executable, "-m", "experiments", "list"]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(order, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith("OSError: [Errno 28]")
+    assert len(done.stderr.splitlines()) == 1
+
+
 def test_help_names_every_command_and_a_wrong_one_is_told_the_right_ones(run):
     status, out, _ = run("--help")
     assert status == 0

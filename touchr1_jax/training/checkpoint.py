@@ -7,6 +7,7 @@ place.
 
 import itertools
 import json
+import logging
 import math
 import sys
 import zlib
@@ -51,6 +52,16 @@ class Restored(NamedTuple):
     step: int
     state: Any
     data: Any
+
+
+def _not_of_a_failed_save(record: logging.LogRecord) -> bool:
+    """False of what threads of a save log of their failure, tracebacks of pages: the save raises it in one line."""
+    failed = record.levelno >= logging.ERROR
+    return not failed or not ("/orbax/" in record.pathname or "Event loop is closed" in str(record.exc_info))
+
+
+for _name in ("absl", "concurrent.futures"):
+    logging.getLogger(_name).addFilter(_not_of_a_failed_save)
 
 
 def _complain(text: str) -> None:
