@@ -56,12 +56,10 @@ class Restored(NamedTuple):
 
 def _not_of_a_failed_save(record: logging.LogRecord) -> bool:
     """False of what threads of a save log of their failure, tracebacks of pages: the save raises it in one line."""
-    failed = record.levelno >= logging.ERROR
-    return not failed or not ("/orbax/" in record.pathname or "Event loop is closed" in str(record.exc_info))
+    return record.levelno < logging.ERROR or "/orbax/" not in record.pathname
 
 
-for _name in ("absl", "concurrent.futures"):
-    logging.getLogger(_name).addFilter(_not_of_a_failed_save)
+logging.getLogger("absl").addFilter(_not_of_a_failed_save)
 
 
 def _complain(text: str) -> None:
