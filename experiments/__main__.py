@@ -48,6 +48,9 @@ def main() -> None:
     except KeyboardInterrupt:  # a run handles the signal itself
         print_error("Stopped before any work began.")
         status = SIGNALLED + signal.SIGINT
+    except OSError as error:
+        print_error(f"{type(error).__name__}: {error}: the output cannot be written; free some space")
+        status = 1
     leave(status)
 
 

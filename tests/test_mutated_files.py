@@ -144,7 +144,11 @@ def files_of_people(folder):
             plain(zero | {"rms_n": 0.1, "rms_nmm": 0.1, "poses": 8, "down": [0, 0, -1]}),
             ValueError,
         ),
-        "labels": (file_of(folder / "l.csv", label.read_labels), b"object_id,hardness\nmug,1\npen,2\n", UserError),
+        "labels": (
+            file_of(folder / "l.csv", lambda path: label.read_labels(path, "object_id")),
+            b"object_id,hardness\nmug,1\npen,2\n",
+            UserError,
+        ),
         "PhysiCLeAR": (
             file_of(folder / "labels.json", read_labels),
             plain({"objects": [mug | {"material": "rubber", "videos": ["a.avi"]}]}),

@@ -26,6 +26,7 @@ from experiments.core.runner import COMPILED
 from experiments.study.policies import find_policy, is_policy, measured_figures
 from sensors_io.errors import UserError
 from sensors_io.records import RecordStore
+from sensors_io.scenes.backend import require_backend
 from touchr1_jax.asking import HUB, AskablePolicy, push
 from touchr1_jax.models.load import WeightsError
 from touchr1_jax.models.saved_policy import Precision, save_policy
@@ -195,6 +196,7 @@ def run_asking(arguments: Sequence[str]) -> int:
     kept = compilations_kept(command.cache_dir / COMPILED) if arguments[0] != "export" else contextlib.nullcontext()
     try:
         with kept:
+            require_backend()
             return command.run()
     except FAILURES as error:
         print_error(f"{type(error).__name__}: {error}")

@@ -35,6 +35,7 @@ from experiments.core.results import Results
 from experiments.core.stopping import Stopped, Stopping
 from experiments.core.text import MEANINGLESS, SMOKE, aligned
 from sensors_io.errors import UserError
+from sensors_io.scenes.backend import require_backend
 from touchr1_jax.distributed.companions import DifferentProcessesError, watched
 from touchr1_jax.distributed.processes import (
     Accelerators,
@@ -271,6 +272,7 @@ def _execute(experiment: Experiment[Any], command: Any, about: str, typed: str) 
         common = {"experiment": experiment.name, "config": jsonable(command.config), "code": runs.code_digest()}
         common |= {"versions": runs.versions(), "settings": numerics.settings(), "mesh": jsonable(command.launch.mesh)}
         with watched(processes.count, processes.index, common, fate):
+            require_backend()
             require_accelerators(command.scale, experiment.needs.get(command.scale))
             chosen, resumed = processes.broadcast(lambda: _directory(experiment, command, typed))
             directory = Path(chosen)
@@ -280,9 +282,8 @@ def _execute(experiment: Experiment[Any], command: Any, about: str, typed: str) 
                     _announce(directory, resumed)
                 _compute(experiment, command, directory, about, stopping, processes)
     except KNOWN_ERRORS as error:
-        print_error(f"{type(error).__name__}: {error}")
-        if directory is not None:
-            print_lines(fate())
+        told = f"{type(error).__name__}: {error}"
+        print_error(told if directory is None else f"{told}\n{fate()}")  # standard output may be on the full disk
         return 1
     except Stopped as stopped:
         print_lines(f"\nStopped by {stopped}. {fate()}")

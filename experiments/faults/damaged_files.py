@@ -59,7 +59,7 @@ def damage_each(unfinished: Path, scratch: Path, context: Context, most: int | N
         apply(folder / path.relative_to(unfinished))
         code, output = _continued(folder)
         outcome = end_of_run(folder / "runs" / "counting", code, output, wanted)
-        yield Damage(file=_kind(path), damage=damage, outcome=outcome, message=telling_line(output))
+        yield Damage(file=_kind(path), damage=damage, outcome=outcome, message=telling_line(output, scratch))
         shutil.rmtree(folder)
 
 
@@ -71,9 +71,10 @@ def _continued(folder: Path) -> tuple[int, str]:
     return code, err.getvalue() + out.getvalue()
 
 
-def telling_line(output: str) -> str:
-    """The first line that a session printed about an error or damage."""
-    return next((line for line in output.splitlines() if "Error" in line or " damaged" in line), "")
+def telling_line(output: str, scratch: Path) -> str:
+    """The first line that a session printed about an error or damage, without the path of the scratch folder."""
+    found = next((line for line in output.splitlines() if "Error" in line or " damaged" in line), "")
+    return found.replace(str(scratch), "…")
 
 
 def end_of_run(runs: Path, code: int, output: str, wanted: Mapping[str, str]) -> str:

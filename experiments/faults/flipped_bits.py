@@ -115,7 +115,7 @@ def go_on_flipped(
             if home / one.path in left:
                 flip_bit(home / one.path, one.bit)
         outcome = end_of_run(home / training.name, code, output, wanted)
-        yield Damage(file=name, damage="a random bit flipped", outcome=outcome, message=telling_line(output))
+        yield Damage(file=name, damage="a random bit flipped", outcome=outcome, message=telling_line(output, scratch))
         shutil.rmtree(home)
 
 

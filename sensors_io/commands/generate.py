@@ -10,6 +10,7 @@ from sensors_io import overview
 from sensors_io.commands.console import OUT, progress_bar
 from sensors_io.generate import generate_records
 from sensors_io.records import RecordStore
+from sensors_io.scenes.backend import require_backend
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS
 from sensors_io.units import Launcher
@@ -28,6 +29,7 @@ class Generate:
     launcher: Annotated[Launcher, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Launcher)
 
     def run(self) -> int:
+        require_backend()
         each = len(SENSORS) * self.config.frame_count
         with progress_bar("records") as progress:
             report = lambda done, total: progress(done * each, total * each)

@@ -203,7 +203,7 @@ def read_items(path: str | os.PathLike[str]) -> tuple[Item, ...]:
     """The items of a file.
 
     Raises:
-      ItemError: naming the line; an id that occurs twice.
+      ItemError: naming the line; an id that occurs twice; a file without items.
     """
     items = []
     for number, tree in read_lines(path):
@@ -211,6 +211,7 @@ def read_items(path: str | os.PathLike[str]) -> tuple[Item, ...]:
             items.append(Item.from_json(tree))
         except ItemError as error:
             raise ItemError(f"{path}, line {number}: {error}") from error
+    _require(bool(items), "number of items", 0, f"must be ≥ 1 in {path}", "write them first")
     seen: set[str] = set()
     for item in items:
         _require(item.ask.id not in seen, f"{path}: id", item.ask.id, "must be unique", "rename one of them")

@@ -7,6 +7,7 @@ place.
 
 import itertools
 import json
+import logging
 import math
 import sys
 import zlib
@@ -51,6 +52,14 @@ class Restored(NamedTuple):
     step: int
     state: Any
     data: Any
+
+
+def _not_of_a_failed_save(record: logging.LogRecord) -> bool:
+    """False of what threads of a save log of their failure, tracebacks of pages: the save raises it in one line."""
+    return record.levelno < logging.ERROR or "/orbax/" not in record.pathname
+
+
+logging.getLogger("absl").addFilter(_not_of_a_failed_save)
 
 
 def _complain(text: str) -> None:

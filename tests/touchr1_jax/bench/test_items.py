@@ -69,6 +69,13 @@ def test_a_missing_field_is_named():
         Item.from_json(tree)
 
 
+def test_a_file_without_items_is_named(tmp_path):
+    """Their scores would be shares of nothing."""
+    (tmp_path / "i.jsonl").write_text("")
+    with pytest.raises(ItemError, match=r"number of items is 0: must be ≥ 1 in .*jsonl; write them first"):
+        read_items(tmp_path / "i.jsonl")
+
+
 def test_ids_are_unique(tmp_path):
     write_items(tmp_path / "i.jsonl", [items()[0], items()[0]])
     with pytest.raises(ItemError, match="id is 'h': must be unique"):

@@ -1,10 +1,13 @@
 """Checkpoints: what comes back is what went in, and nothing half-written counts."""
 
+import logging
 import resource
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import orbax.checkpoint as ocp
 import pytest
 
 from tests.touchr1_jax.training.stepping import feed, start, step
@@ -216,3 +219,13 @@ def test_a_digest_is_that_of_the_formula():
 def test_at_least_one_is_kept(tmp_path):
     with pytest.raises(ValueError, match="keep is 0: must be at least 1"):
         Checkpoints(tmp_path, keep=0)
+
+
+def test_a_failed_save_is_told_once(tmp_path, caplog):
+    """Threads of Orbax log tracebacks of the failure that `Checkpoints` raises; other errors pass."""
+    where = Path(ocp.__file__).parent / "x.py"
+    for name, path, told in (("absl", where, False), ("absl", tmp_path / "x.py", True), ("orbax", where, True)):
+        logger = logging.getLogger(name)
+        logger.handle(logger.makeRecord(name, logging.ERROR, str(path), 1, "no space", (), None))
+        assert ("no space" in caplog.text) == told
+        caplog.clear()
