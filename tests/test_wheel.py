@@ -14,7 +14,6 @@ import touchr1_jax
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("touchr1_jax", "sensors_io", "experiments")
-ANSWER = "<perceive> xense soft </perceive> <compare> soft </compare> <conclude> soft </conclude>"
 
 pytestmark = [
     pytest.mark.slow,
@@ -76,11 +75,12 @@ def test_both_are_ready_for_an_index(built):
 
 
 def test_the_policy_of_the_package_loads_in_an_empty_folder(installed, tmp_path):
-    environment = {**os.environ, "PYTHONPATH": str(installed), "JAX_PLATFORMS": "cpu"}
-    code = "import touchr1_jax as t; print(t.__file__, t.__version__, t.load_policy().name)"
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
-    assert done.stdout.split()[0].startswith(str(installed)), done.stderr
-    assert done.stdout.split()[1:] == [touchr1_jax.__version__, "touch-small"]
+    (tmp_path / "loads.py").write_text(
+        "import touchr1_jax as t\nprint(t.__file__, t.__version__, t.load_policy().name)"
+    )
+    place, *rest = run(installed, tmp_path, "loads").stdout.split()
+    assert place.startswith(str(installed))
+    assert rest == [touchr1_jax.__version__, "touch-small"]
 
 
 def test_an_experiment_runs_in_an_empty_folder(installed, tmp_path):
@@ -91,35 +91,19 @@ def test_an_experiment_runs_in_an_empty_folder(installed, tmp_path):
     assert (installed / "experiments" / "bench" / "paper_audit.py").exists()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "printed"),
-    [
-        (("touchr1_jax.rewards", "explain", "--text", ANSWER), "total"),
-        (("touchr1_jax.models.load", "--help"), "Read a checkpoint"),
-        (("sensors_io", "--help"), "calibrate"),
-        (("experiments.bench", "--help"), "annotate"),
-    ],
-    ids=lambda value: value[0] if isinstance(value, tuple) else "",
-)
-def test_every_command_answers(installed, tmp_path, arguments, printed):
-    done = run(installed, tmp_path, *arguments)
-    assert done.returncode == 0, done.stderr
-    assert printed in done.stdout
+def test_every_command_answers(installed, tmp_path):
+    for module, printed in (
+        ("touchr1_jax.rewards", "explain"),
+        ("touchr1_jax.models.load", "Read a checkpoint"),
+        ("sensors_io", "calibrate"),
+        ("experiments.bench", "annotate"),
+    ):
+        assert printed in run(installed, tmp_path, module, "--help").stdout, module
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("experiments", "new", "brevity", "--reward"),
-        ("experiments.core.recorded", "fill"),
-    ],
-    ids=" ".join,
-)
-def test_what_needs_a_checkout_says_so_and_writes_nothing(installed, tmp_path, arguments):
-    before = sorted(path for path in installed.rglob("*") if path.suffix != ".pyc" and path.name != "__pycache__")
-    done = run(installed, tmp_path, *arguments)
+def test_what_needs_a_checkout_says_so_and_writes_nothing(installed, tmp_path):
+    done = run(installed, tmp_path, "experiments", "new", "brevity", "--reward")
     assert done.returncode == 1
     assert "must be a checkout of the project; clone it and work there" in done.stderr
-    assert "Traceback" not in done.stderr
-    assert before == sorted(p for p in installed.rglob("*") if p.suffix != ".pyc" and p.name != "__pycache__")
     assert not list(tmp_path.iterdir())
+    assert not list(installed.rglob("brevity*"))

@@ -1,11 +1,13 @@
 """The tutorial, done to the letter in a copy of the sources: its files are written, its commands run."""
 
+import json
 import os
 import re
 import shlex
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -24,23 +26,47 @@ NEW_FILES = {"touchr1_jax/rl/knocking.py", "tests/touchr1_jax/rl/test_knocking.p
 @pytest.fixture
 def checkout(tmp_path):
     """A copy of what a reader has."""
-    skip = shutil.ignore_patterns("__pycache__", "data", "figures")
+    skip = shutil.ignore_patterns("data", "figures")
     for package in ("touchr1_jax", "sensors_io", "experiments", "tests"):
         shutil.copytree(ROOT / package, tmp_path / package, ignore=skip)
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
     return tmp_path
 
 
-def run(checkout: Path, *arguments: str) -> str:
-    """What a Python command prints in the copy, whose sources come before the installed ones."""
-    environment = {**os.environ, "PYTHONPATH": str(checkout), "PYTHONDONTWRITEBYTECODE": "1"}
-    command = [sys.executable, *arguments]
-    done = subprocess.run(command, cwd=checkout, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+FORKS = """
+import json, os, runpy, sys
+import flax.linen, jax, optax, pytest, scipy.stats, tyro
+for line in sys.stdin:
+    child = os.fork()
+    if not child:
+        os.dup2(os.open("printed", os.O_CREAT | os.O_TRUNC | os.O_WRONLY), 1)
+        os.dup2(1, 2)
+        sys.argv = json.loads(line)
+        sys.exit(runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True) and 0)
+    print(os.waitpid(child, 0)[1], flush=True)
+"""
+"""Runs one module after the other, each in a fork that has imported already what all of them take seconds to import."""
 
 
-def follow(checkout: Path, commands_left_out: tuple[str, ...]) -> list[str]:
+@pytest.fixture
+def run(checkout):
+    """Runs a Python module in the copy, whose sources come before the installed ones; what it prints."""
+    environment = {**os.environ, "PYTHONPATH": str(checkout)}
+    with subprocess.Popen(
+        [sys.executable, "-c", FORKS], cwd=checkout, env=environment, stdin=-1, stdout=-1, text=True
+    ) as process:
+
+        def once(*arguments: str) -> str:
+            print(json.dumps(arguments), file=process.stdin, flush=True)
+            status, printed = process.stdout.readline(), checkout / "printed"
+            assert status == "0\n", printed.read_text()
+            return printed.read_text()
+
+        yield once
+        process.stdin.close()
+
+
+def follow(checkout: Path, run: Callable[..., str]) -> list[str]:
     """Do what each block says; the commands that were run."""
     printed, done = "", []
     for kind, body in FENCE.findall(TUTORIAL.read_text(encoding="utf-8")):
@@ -52,28 +78,27 @@ def follow(checkout: Path, commands_left_out: tuple[str, ...]) -> list[str]:
         elif kind == "text":
             missing = [line for line in body.splitlines() if line not in printed]
             assert not missing, f"not printed: {missing}\n{printed}"
-        elif body.strip() not in commands_left_out:
-            program, *arguments = shlex.split(body)
-            assert program == "python"
-            printed = run(checkout, *arguments)
-            done.append(arguments[1])
+        elif body.strip() != RUN:
+            python, option, *arguments = shlex.split(body)
+            assert (python, option) == ("python", "-m")
+            printed = run(*arguments)
+            done.append(arguments[0])
     return done
 
 
-def test_every_step_does_what_it_says(checkout):
+def test_every_step_does_what_it_says(checkout, run):
     assert RUN in TUTORIAL.read_text(encoding="utf-8")
-    assert follow(checkout, (RUN,)) == ["experiments", "pytest", "touchr1_jax.rewards", "experiments", "pytest"]
-    proof = (
-        "from experiments.paper.brevity import ABLATION, EXPERIMENT as E; from experiments.study import study as s; "
+    assert follow(checkout, run) == ["experiments", "pytest", "touchr1_jax.rewards", "experiments", "pytest"]
+    (checkout / "proof.py").write_text(
+        "from experiments.paper.brevity import ABLATION, EXPERIMENT\nfrom experiments.study.study import check_arms\n"
+        "check_arms(ABLATION.arms); print(EXPERIMENT.name)"
     )
-    assert run(checkout, "-c", proof + "s.check_arms(ABLATION.arms); print(E.name)") == "brevity\n"
+    assert run("proof") == "brevity\n"
 
 
 @pytest.mark.slow
-def test_the_template_runs_as_it_stands(checkout):
-    run(checkout, "-m", "experiments", "new", "answered", "--reward")
-    run(checkout, "-m", "pytest", "-q", "tests/touchr1_jax/rewards/test_answered.py", "tests/test_architecture.py")
-    out = run(checkout, "-m", "experiments", "answered", "--scale", "smoke")
-    assert "report: runs/answered" in out
+def test_the_template_runs_as_it_stands(checkout, run):
+    run("experiments", "new", "answered", "--reward")
+    run("pytest", "-q", "tests/touchr1_jax/rewards/test_answered.py", "tests/test_architecture.py")
+    assert "report: runs/answered" in run("experiments", "answered", "--scale", "smoke")
     assert "reward_answered" in (checkout / "runs" / "answered" / "latest" / "metrics.jsonl").read_text()
-    assert "finished" in run(checkout, "-m", "experiments", "list", "answered")

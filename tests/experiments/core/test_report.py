@@ -182,5 +182,6 @@ def test_a_text_is_cut_at_its_segments():
 def test_rollouts_of_a_group_fold_away_under_its_heading(tmp_path, results):
     examples = tuple(dataclasses.replace(coin.example(), group=group) for group in (HOSTILE, HOSTILE, "far off", ""))
     page = write(tmp_path, dataclasses.replace(results, examples=examples))
+    page = page[page.index("A few rollouts") : page.index("Data and time")]
     found = [page.count(text) for text in ("<b>Question </b>", "<details", '<details open="open">', "<script")]
     assert found == [4, 2, 1, 0]
