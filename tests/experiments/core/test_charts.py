@@ -95,6 +95,16 @@ def test_a_heatmap_names_its_rows_columns_and_cells():
     assert {"low", "high", "left", "right", "t", "1", "4", "share"} <= texts(heatmaps([shown], colour_bar="share"))
 
 
+def test_a_rule_of_both_axes_is_a_corner_and_labels_stand_at_the_left():
+    both = Rule(x=1, y=2, keep="above", line="-", colour=PALETTE[3])
+    ((top, corner, end),) = lines(draw([Panel([Series(x=[0, 4], y=[0, 4], marker="")], rules=[both])]), PALETTE[3])
+    assert (top[0], corner[1]) == pytest.approx((corner[0], end[1]), abs=0.01)
+    assert top[1] < corner[1]
+    assert end[0] < corner[0]
+    three = heatmaps([Heatmap(np.eye(2), rows="ab", columns="cd", title="t")] * 3, columns=2, y_label="down")
+    assert three.count(b"<!-- down -->") == 2
+
+
 def test_an_image_grid_places_pictures_by_row_and_column():
     red, blue = (np.full((8, 8, 3), colour, np.uint8) for colour in ((255, 0, 0), (0, 0, 255)))
     png = image_grid({"a": [red, red], "b": [blue]}, ["one", "two"], cell_inch=0.5)
