@@ -11,18 +11,17 @@ from jaxtyping import Array, Bool, Float, Int
 
 from experiments.active.feed import DrawnFeed
 from experiments.active.plans import NO_CHOICE, Answer, Played
-from experiments.core.context import Context, read_metrics
+from experiments.core.context import Context
 from experiments.core.loops import stage_hooks
-from experiments.study.alarm_log import ALARM
+from experiments.study.alarm_log import alarm_log
 from touchr1_jax.models.active_policy import ActivePolicy, Explored
 from touchr1_jax.rl.active import make_explore
 from touchr1_jax.rl.active_alarms import ACTIVE_RULES
-from touchr1_jax.rl.alarms import AlarmMonitor
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.environment import TouchBank
 from touchr1_jax.rl.touch_reward import Prices
 from touchr1_jax.training.exploration import ActiveFeed, RandomTouchFeed, touch_batch_of, train_active
-from touchr1_jax.training.loop import Log, LoopConfig
+from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.sft import SFTBatch
 from touchr1_jax.training.train_sft import SFTConfig, train_sft
 from touchr1_jax.types import Params
@@ -163,26 +162,9 @@ def reinforce(
     """
     config = dataclasses.replace(config, length=policy.tokens(budget))
     feed = ActiveFeed(policy, bank, batch_size=config.drawn, seed=seed, dropout=dropout)
-    with stage_hooks(context, stage, loop.steps, make_log=_with_alarms) as hooks:
+    make_log = functools.partial(alarm_log, rules=ACTIVE_RULES)
+    with stage_hooks(context, stage, loop.steps, make_log=make_log) as hooks:
         return train_active(policy, params, feed, bank, config, loop, hooks, prices=prices, budget=budget, seed=seed)
-
-
-def _with_alarms(context: Context, stage: str, start: int) -> Log:
-    """A function that logs the metrics of each step, and `alarm_A1` with the number that fired."""
-    monitor, told = AlarmMonitor(ACTIVE_RULES), set[str]()
-    for line in read_metrics(context.directory):
-        if line["stage"] == stage and line["step"] < start:
-            told |= {alarm.code for alarm in monitor.update(line)}
-
-    def log(t: int, metrics: dict[str, float]) -> None:
-        alarms = monitor.update(metrics)
-        for alarm in alarms:
-            if alarm.code not in told:
-                context.print(f"{stage}, step {t}: {alarm}")
-                told.add(alarm.code)
-        context.log(stage, t, **metrics, **{f"{ALARM}{alarm.code}": alarm.value for alarm in alarms})
-
-    return log
 
 
 def explore(

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from experiments.core.context import Context, read_metrics
-from touchr1_jax.rl.alarms import AlarmMonitor
+from touchr1_jax.rl.alarms import RULES, AlarmMonitor, AlarmRule
 from touchr1_jax.rl.scoring import NONFINITE_IN
 from touchr1_jax.training.loop import SKIPPED
 
@@ -11,14 +11,16 @@ ALARM = "alarm_"
 """Prefix of the logged metrics that hold alarms, followed by their code."""
 
 
-def alarm_log(context: Context, stage: str, start: int) -> Callable[[int, dict[str, float]], None]:
+def alarm_log(
+    context: Context, stage: str, start: int, rules: tuple[AlarmRule, ...] = RULES
+) -> Callable[[int, dict[str, float]], None]:
     """A function that logs the metrics of each step and the alarms they raise, `alarm_F7` with the number that fired.
 
     Each alarm of a stage is also printed once, and so is each reward that is not finite and the first update that is
     left out.  A stage that resumes at step `start` first looks at the steps that it logged before, so that its lines
     are those of an uninterrupted run.
     """
-    monitor, printed = AlarmMonitor(), set[str]()
+    monitor, printed = AlarmMonitor(rules), set[str]()
 
     def alarms_of(metrics: dict[str, float], t: int, *, aloud: bool) -> dict[str, float]:
         left_out = SKIPPED in metrics  # then the numbers that are not finite are missing
