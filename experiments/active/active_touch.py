@@ -106,8 +106,6 @@ class ActiveTouchConfig:
         for name in ("second_price", "second_prices", "harm_price"):
             if not (np.isfinite(getattr(self, name)) & (np.asarray(getattr(self, name)) >= 0)).all():
                 raise ConfigurationError(f"{name} is {getattr(self, name)}: must be finite and at least 0; correct it")
-        if self.agents:
-            check_installed()
 
     def arms(self, seed: int) -> dict[str, Arm]:
         """The reinforced policies of a seed."""
@@ -122,6 +120,8 @@ class ActiveTouchConfig:
 
 def run(config: ActiveTouchConfig, context: Context) -> Results:
     """Make the world, report the headroom, train and score every seed."""
+    if config.agents:
+        check_installed()
     real = None if config.physiclear is None else stopping(config.videos, config.physiclear, context)
     world = make_world(config.world, context)
     policy = make_policy(world, config.learner)

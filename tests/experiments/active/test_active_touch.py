@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from experiments.active import active_touch
+from experiments.active import active_touch, stability_touch
 from experiments.active.active_touch import ActiveTouchConfig
 from experiments.active.findings import METRIC, verdict
 from experiments.core.artifacts import read_json
@@ -48,6 +48,14 @@ def test_a_shrunken_run_scores_every_plan_at_equal_seconds(tmp_path):
     assert {*(directory / "policies").glob("*/0")} == {
         directory / "policies" / name / "0" for name in ("chosen", "chosen_2", "chosen_harm")
     }
+
+
+@pytest.mark.slow  # generates contacts and compiles a step
+def test_a_shrunken_run_of_seeds_tells_their_first_motions(tmp_path):
+    config = dataclasses.replace(stability_touch.SMOKE, world=TINY.world, learner=TINY.learner, seeds=1)
+    directory = run_shrunk(stability_touch, config, tmp_path, "--cache-dir", str(tmp_path / "cache"))
+    (table,) = read_json(directory / "results.json")["tables"]
+    assert [row[0] for row in table["rows"]] == ["0"]
 
 
 @pytest.mark.parametrize("field", ["seeds", "full_seeds", "contacts"])

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments.active import active_touch
 from experiments.active.active_touch import ActiveTouchConfig
 from experiments.active.arms import Arm, check_arms
 from experiments.active.contacts import ContactsConfig
@@ -62,4 +63,4 @@ def test_agents_that_are_not_installed_are_refused_before_contacts_are_made(monk
     with pytest.raises(
         ConfigurationError, match=r"stable_baselines3 not installed; run pip install 'touchr1-jax\[agents\]'"
     ):
-        ActiveTouchConfig(agents=True)
+        active_touch.run(ActiveTouchConfig(agents=True), None)
