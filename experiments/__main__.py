@@ -1,5 +1,6 @@
 """`python -m experiments`: run, continue, list, start and compare experiments, ask trained policies."""
 
+import errno
 import multiprocessing
 import os
 import signal
@@ -49,6 +50,8 @@ def main() -> None:
         print_error("Stopped before any work began.")
         status = SIGNALLED + signal.SIGINT
     except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
         print_error(f"{type(error).__name__}: {error}: the output cannot be written; free some space")
         status = 1
     leave(status)

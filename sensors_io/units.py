@@ -11,6 +11,7 @@ import functools
 import hashlib
 import importlib
 import importlib.metadata
+import multiprocessing
 import os
 import pathlib
 import platform
@@ -167,7 +168,7 @@ _Engine = tuple[tuple[type[BaseException], ...], Callable[[Sequence[_Group]], li
 def _local(launcher: Launcher) -> _Engine:
     """A process for each of some threads, so that one that dies ends no other."""
     threads, pools = concurrent.futures.ThreadPoolExecutor(launcher.workers), threading.local()
-    context = importlib.import_module("multiprocessing").get_context("spawn")
+    context = multiprocessing.get_context("spawn")
     made: list[concurrent.futures.ProcessPoolExecutor] = []
 
     def call(group: tuple[WorkUnit, ...]) -> dict[str, str]:

@@ -161,7 +161,7 @@ def _stated(file: Any, place: Place, of: ValueMap, name: str) -> Any:
 def _whole(value: Any, name: str) -> int:
     try:
         return int(value)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise HDF5Error(f"{name} is {value!r}: must be a whole number") from error
 
 

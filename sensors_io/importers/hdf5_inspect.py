@@ -82,6 +82,9 @@ def _lines(group: Any, indent: str) -> Iterator[str]:
             stated = ", ".join(f"{a} {item.attrs[a]}" for a in STATED if a in item.attrs)
             yield f"{indent}{name}  {item.dtype}{list(item.shape)}{f'  ({stated})' if stated else ''}"
             continue
+        if not isinstance(item, h5py().Group):
+            yield f"{indent}{name}  (broken link)" if item is None else f"{indent}{name}  (named type)"
+            continue
         contents = _contents(item)
         seen[contents] += 1
         if seen[contents] == 1:

@@ -7,12 +7,18 @@ import re
 import shutil
 import subprocess
 import sys
+import types
 
+import numpy as np
 import pytest
+from rich.console import Console
 
 from sensors_io import __main__ as cli
+from sensors_io.commands import console as printing
 from sensors_io.commands import generate as generating
 from sensors_io.commands.console import ERR, OUT
+from sensors_io.importers.pictures import read_picture
+from sensors_io.records import RecordWriter
 from tests.sensors_io import fakes
 from tests.sensors_io.importers.films import entry, folder
 
@@ -195,3 +201,53 @@ for module in {sorted(modules)}:
 sys.exit(bool({set(heavy.split())} & set(sys.modules)))
 """
         assert subprocess.run([sys.executable, "-c", source], check=False).returncode == 0
+
+
+def test_check_says_that_records_are_incomplete(run, tmp_path):
+    with RecordWriter(tmp_path, meta=fakes.META) as writer:
+        writer.publish()
+        status, _, err = run("check", tmp_path)
+    assert status == 1
+    assert err.strip().startswith("IncompleteRecordsError: ")
+
+
+def test_an_interrupt_says_how_to_go_on(run, tmp_path, monkeypatch):
+    def stop(*args, **kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(generating, "generate_records", stop)
+    status, _, err = run("generate", "--out", tmp_path / "r")
+    assert status == 130
+    assert "run the same command again" in err
+
+
+def test_check_looks_at_pictures_where_it_can(run, tmp_path):
+    """Real presses of a Mini beside their gel at rest; the other sensors' noise has no background and says so."""
+    gelslam = pathlib.Path(__file__).resolve().parents[1] / "data" / "gelslam"
+    names = ("background", "press_12", "press_14", "press_18")
+    frames = np.stack([read_picture(gelslam / f"{name}.png") for name in names])
+    fakes.write(tmp_path, 1, sensors=("tac3d",))
+    with RecordWriter(tmp_path, meta=fakes.META, resume=True) as writer:
+        n = len(frames)
+        shown = fakes.sequence(0, length=n, trial=1, frames=frames, camera={"recording": {"background": "rest.png"}})
+        writer.write_contact([shown])
+        writer.write_contact([fakes.sequence(0, trial=2)])
+    shutil.copy(gelslam / "background.png", tmp_path / "rest.png")
+    status, out, _ = run("check", tmp_path, "--pictures")
+    assert status == 0
+    looked = out[out.index("flags by the pictures") :]
+    assert re.search(r"no_contact\W+1 ", looked)
+    assert "not looked at: 1 sequences, they hold no pictures" in out
+    assert "not looked at: 1 sequences, no gel at rest was recorded" in out
+
+
+def test_progress_without_a_terminal_is_told_in_lines(monkeypatch):
+    """The first contact was there before; what came within ten seconds of the last line, or ends it, is not told."""
+    told = io.StringIO()
+    monkeypatch.setattr(printing, "ERR", Console(file=told, width=200))
+    clock = iter([0.0, 5.0, 10.0, 12.0, 20.0])
+    monkeypatch.setattr(printing, "time", types.SimpleNamespace(monotonic=lambda: next(clock)))
+    with printing.progress_bar("contacts") as progress:
+        for done in (2, 3, 4, 5):
+            progress(done, 5)
+    assert told.getvalue() == "contacts: 3/5, 0.2/s, 10 s left\n"

@@ -44,6 +44,10 @@ def attempts(folder: pathlib.Path) -> dict[str, int]:
     return {path.stem: len(path.read_text().split()) for path in sorted(folder.glob("*.attempts"))}
 
 
+WORKERS = pytest.mark.parametrize("launcher", [name for name in ENGINES if name != "here"], indirect=True)
+"""In the driver's own process a killed unit kills the driver, and an error is raised as it is."""
+
+
 @pytest.fixture(params=ENGINES)
 def launcher(request, tmp_path, monkeypatch):
     if request.param in NEEDS:
@@ -68,10 +72,9 @@ def test_every_unit_is_run_once_and_none_that_is_done(launcher, folder):
     assert said == []
 
 
+@WORKERS
 @pytest.mark.filterwarnings("ignore")
 def test_a_killed_worker_costs_its_unit_one_more_run(launcher, folder):
-    if launcher.here:
-        pytest.skip("the driver itself would die")
     said = []
     ended = list(finish(listed(folder, u1="kill", u4="kill"), launcher, said.append))
     assert sorted(unit.name for unit in ended) == [f"u{i}" for i in range(6)]
@@ -80,10 +83,9 @@ def test_a_killed_worker_costs_its_unit_one_more_run(launcher, folder):
     assert all("its worker died" in line for line in said)
 
 
+@WORKERS
 @pytest.mark.filterwarnings("ignore")
 def test_a_unit_that_fails_is_named_after_the_others_are_done(launcher, folder):
-    if launcher.here:
-        pytest.skip("here it raises its own error, with its own traceback")
     work = listed(folder, u1="raise")
     with pytest.raises(UnitsError, match=r"^1 of 6 units failed, the first u1: .*u1 cannot be made"):
         list(finish(work, launcher))

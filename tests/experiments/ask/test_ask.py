@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import json
 import re
+import socket
 import sys
 import types
 import urllib.error
@@ -266,3 +267,22 @@ def test_policies_of_the_package_are_small_and_have_a_card(name):
     files = {path.name: path.stat().st_size for path in (SHIPPED / name).iterdir()}
     assert sum(files.values()) < 800_000
     assert {"limits", "measured"} <= load_policy(name).saved.notes.keys()
+
+
+def test_requests_of_no_browser_are_refused_without_a_word_in_the_terminal(address, capfd):
+    """Lengths that are none, an upload that ends early, a name that is no file's, addresses that are none."""
+    split = urllib.parse.urlsplit(address)
+    host = f"Host: {split.netloc}\r\n".encode()
+    for request, status in (
+        (b"POST /video?name=a.avi HTTP/1.1\r\n" + host + b"Content-Length: \xb2\r\n\r\n", b"413"),
+        (b"POST /video?name=a.avi HTTP/1.1\r\n" + host + b"Content-Length: 9\r\n\r\nabc", b"400"),
+        (b"POST /video?name=a.%00 HTTP/1.1\r\n" + host + b"Content-Length: 3\r\n\r\nabc", b"400"),
+        (b"GET http://[ HTTP/1.1\r\n" + host + b"\r\n", b"404"),
+        (b"GET / HTTP/1.1\r\nHost: [\r\n\r\n", b"403"),
+    ):
+        with socket.create_connection((split.hostname, split.port), timeout=10) as connection:
+            connection.sendall(request)
+            connection.shutdown(socket.SHUT_WR)
+            answer = b"".join(iter(lambda: connection.recv(65_536), b""))
+        assert answer.partition(b" ")[2].startswith(status), request
+    assert "Traceback" not in capfd.readouterr().err

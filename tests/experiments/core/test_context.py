@@ -141,3 +141,19 @@ def test_the_first_step_bounds_the_time_left_and_later_ones_give_it():
     assert loop.rate == 0.5
     loop.advance(9)
     assert loop.left == ""
+
+
+@pytest.mark.parametrize("flipped", [b"\xdd", b"{"], ids=["no UTF-8", "no JSON"])
+def test_a_log_with_a_flipped_byte_is_named(context, flipped):
+    context.log("sft/0", 0, loss=1.0)
+    path = context.directory / "metrics.jsonl"
+    path.write_bytes(path.read_bytes()[:9] + flipped + path.read_bytes()[10:])
+    with pytest.raises(DamagedFileError, match=r"metrics.jsonl is damaged .* start a new run with --fresh"):
+        read_metrics(context.directory)
+
+
+def test_lines_of_earlier_versions_have_no_checksum_and_are_read(context):
+    context.log("sft/0", 0, loss=1.0)
+    path = context.directory / "metrics.jsonl"
+    path.write_text(path.read_text() + '{"stage": "sft/0", "step": 1, "loss": 0.5}\n')
+    assert [row["loss"] for row in read_metrics(context.directory)] == [1.0, 0.5]

@@ -3,10 +3,11 @@
 import json
 import signal
 
+import jax.numpy as jnp
 import pytest
 
 from experiments.core.artifacts import read_json
-from experiments.core.loops import left_out_tables
+from experiments.core.loops import left_out_tables, run_loop
 from experiments.faults.digests import differences, digests
 from experiments.faults.fixtures import run_counting, run_directory
 from experiments.faults.trainings import counting
@@ -105,3 +106,20 @@ def test_no_run_ends_with_a_part_of_its_log(tmp_path, capsys, kept):
     assert f"of stage count/0 {12 - kept} of 12 steps are missing, the first is {kept}" in error
     assert "put a copy back, or start a new run with --fresh" in error
     assert not (directory / "results.json").exists()
+
+
+def test_the_best_checkpoint_is_kept_with_the_newest(context):
+    """Held-out scores fall from step 4 on, so that its checkpoint outlives two newer ones."""
+    config = counting.CountingConfig()
+    seen = []
+    run_loop(
+        lambda state, target: (state | {"step": state["step"] + 1}, {"loss": jnp.mean(target)}),
+        {"step": jnp.int32(0)},
+        counting.targets(config),
+        config.loop(),
+        context,
+        "count/0",
+        held_out=lambda state: seen.append(int(state["step"])) or -float(state["step"]),
+    )
+    kept = sorted(int(path.name) for path in (context.directory / "checkpoints/count/0").iterdir())
+    assert seen == kept == [4, 8, 12]

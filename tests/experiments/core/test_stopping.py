@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from experiments.core.stopping import SIGNALS, Stopped, Stopping
+from experiments.core.stopping import AGAIN_S, SIGNALS, Stopped, Stopping
 
 
 @pytest.fixture(autouse=True)
@@ -98,3 +98,33 @@ def test_a_stop_that_the_garbage_collector_swallows_is_raised_again(twice):
     finally:
         gc.callbacks.remove(strike)
     assert struck
+
+
+def test_cleaning_up_after_a_stop_is_not_disturbed():
+    closed = []
+
+    def train() -> None:
+        with Stopping().listening():
+            try:
+                signal.raise_signal(signal.SIGTERM)
+            finally:
+                time.sleep(5 * AGAIN_S)
+                closed.append(True)
+
+    with pytest.raises(Stopped, match="SIGTERM"):
+        train()
+    assert closed == [True]
+
+
+def test_other_errors_that_cannot_be_raised_are_reported_as_before(monkeypatch):
+    reported = []
+    monkeypatch.setattr("sys.unraisablehook", lambda lost: reported.append(lost.exc_value))
+
+    class Broken:
+        def __del__(self):
+            raise OSError("the disk is gone")
+
+    with Stopping().listening():
+        broken = Broken()
+        del broken
+    assert [str(x) for x in reported] == ["the disk is gone"]

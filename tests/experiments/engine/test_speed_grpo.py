@@ -1,6 +1,7 @@
 """The timed job and its failing peers; the recipe for sixteen devices, counted."""
 
 import dataclasses
+from typing import get_args
 
 import jax
 import numpy as np
@@ -12,7 +13,7 @@ from experiments.engine.job import Job, config_of
 from experiments.engine.peers import PeerFailed, PeerTimes
 from experiments.engine.processes import in_own_process
 from experiments.engine.scale_paper import DEFAULT
-from experiments.engine.speed import LongRun, time_alone
+from experiments.engine.speed import LongRun, Option, options, time_alone
 from experiments.engine.speed_report import steadiness
 from touchr1_jax.distributed.memory import counted_peak
 
@@ -84,3 +85,23 @@ def test_the_paper_fits_by_count_and_adapters_need_less():
 def test_without_nvidias_compiler_the_error_names_the_packages_to_install():
     with pytest.raises(ModuleNotFoundError, match=r"compiler is h200, but there is no nvidia\.absent: install"):
         compiling.toolkit("nvidia.absent")
+
+
+@pytest.fixture(scope="module")
+def jobs():
+    """Every option, small, after one step each."""
+    every = options(TINY, 16, (4,), get_args(Option))
+    return {name: (job, jax.device_get(job.step())) for name, job in ((name, make()) for name, make in every.items())}
+
+
+@pytest.mark.slow
+def test_options_change_the_cost_and_not_the_step(jobs):
+    """Rewards in the graph and on the host, one micro-batch or several, weights of an exact sampler, rematerialised."""
+    plain = jobs["this"][1]
+    for name in ("one micro-batch", "remat", "lean compilation", "importance weights", "host reward"):
+        assert jobs[name][1]["reward"] == pytest.approx(float(plain["reward"]), rel=1e-6), name
+        assert jobs[name][1]["grad_norm"] == pytest.approx(float(plain["grad_norm"]), rel=1e-4), name
+    assert jobs["bfloat16"][1]["grad_norm"] == pytest.approx(float(plain["grad_norm"]), rel=0.2)
+    short, cut = jobs["short answers"][1], jobs["short answers, buckets"][1]
+    assert short["length"] < TINY.length
+    assert cut["grad_norm"] == pytest.approx(float(short["grad_norm"]), rel=1e-4)

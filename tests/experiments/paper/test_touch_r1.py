@@ -1,11 +1,16 @@
 """The paper's training on released weights: what is refused before anything is made, and the whole run on tiny ones."""
 
 import dataclasses
+import json
+import os
+import signal
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from experiments.core.artifacts import read_json
+from experiments.core.context import Context
 from experiments.core.loops import STEPPING, WAITING
 from experiments.core.results import Estimate
 from experiments.core.runner import main
@@ -72,3 +77,30 @@ def test_the_smoke_run_trains_scores_and_writes(whole):
     said = [f"{ARM}-under-{control}" for control in CONTROLS]
     names = {path.stem for path in (directory / "answers").glob("*.npz")}
     assert names == {f"{name}-0" for name in ("sft", "sft_continued", ARM, "tactile_blind", ZERO, WRITTEN, *said)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", [("sft/0", 5), ("decoder/sft/0", 2), (f"grpo/{ARM}/0", 2)])
+def test_a_stopped_run_ends_in_the_same_bits(whole, tmp_path, monkeypatch, where):
+    log = Context.log
+
+    def stop(self, stage, step, **scalars):
+        log(self, stage, step, **scalars)
+        if (stage, step) == where:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Context, "log", stop)
+        assert run(tmp_path, whole / "data") == 128 + signal.SIGTERM
+    assert run(tmp_path, whole / "data") == 0
+    ended, expected = only_run(tmp_path, "touch_r1"), only_run(whole / "runs", "touch_r1")
+    assert (ended / "metrics.jsonl").read_bytes() == (expected / "metrics.jsonl").read_bytes()
+    for path in (expected / "weights" / "0").iterdir():
+        if path.name != "touch.npz":
+            assert (ended / "weights" / "0" / path.name).read_bytes() == path.read_bytes(), path.name
+    for path in [*(expected / "answers").iterdir(), expected / "weights" / "0" / "touch.npz"]:
+        with np.load(path) as a, np.load(ended / path.relative_to(expected)) as b:
+            assert a.files == b.files
+            assert all(np.array_equal(a[name], b[name]) for name in a.files), path.name
+    lines = [json.loads(line) for line in (ended / "metrics.jsonl").read_text().splitlines()]
+    assert sum(line["stage"] == where[0] for line in lines) == (8 if where[0] == "sft/0" else 4)

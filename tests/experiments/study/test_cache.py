@@ -3,6 +3,8 @@
 import ast
 import dataclasses
 import io
+import json
+import shutil
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +16,7 @@ from experiments.core.context import Context
 from experiments.core.runs import ROOT
 from experiments.study.cache import LATER, NEVER, USED, fingerprint, source_digest
 from experiments.study.stages import EncodedContacts, StudySFT, make_arm, run_grpo, run_sft
+from sensors_io.records import RecordStore
 from tests.experiments import tiny
 from touchr1_jax.training.loop import LoopConfig
 
@@ -163,3 +166,23 @@ def test_the_source_that_sft_is_built_on_counts():
                 imported = (node.module or "").replace(".", "/")
                 counts = not f"{imported}/".startswith(LATER) and not f"{imported}.py".startswith(LATER)
                 assert counts or f"{imported}.py" in USED, f"{name} imports {node.module}"
+
+
+def test_a_resumed_run_keeps_the_order_of_its_log(sft, first, home):
+    log = home / "first" / "metrics.jsonl"
+    before = log.read_bytes() + b'{"stage": "grpo/a/0", "step": 0}\n'
+    log.write_bytes(before)
+    sft("first")
+    assert log.read_bytes() == before
+
+
+def test_other_records_are_another_checkpoint(data, tmp_path):
+    """The same touch may come with other pictures: the index knows, by its configuration and its shards' sizes."""
+    shutil.copytree(data.store.path, tmp_path / "other")
+    index = tmp_path / "other" / "index.json"
+    assert RecordStore(tmp_path / "other").digest == data.store.digest
+    tree = json.loads(index.read_text())
+    tree["meta"]["config_hash"] += "0"
+    del tree["crc32"]
+    index.write_text(json.dumps(tree))
+    assert RecordStore(tmp_path / "other").digest != data.store.digest

@@ -16,9 +16,9 @@ from sensors_io.pipeline import clip_batches
 from sensors_io.schema import LEVELS
 from tests.experiments import tiny
 from touchr1_jax.text.oracle import read
-from touchr1_jax.training.feeds import AnswerFeed, encoded_clips, falling_share, random_streams
+from touchr1_jax.training.feeds import AnswerFeed, encoded_clips, falling_share, random_streams, take
 from touchr1_jax.training.packing import Packing
-from touchr1_jax.training.questions import QuestionFeed, equal_blocks
+from touchr1_jax.training.questions import QuestionFeed, equal_blocks, question_batch
 
 
 @pytest.fixture(scope="module")
@@ -299,3 +299,29 @@ def test_the_order_of_questions_is_not_made_ahead(questions):
     feed = questions()
     next(feed)
     assert set(threading.enumerate()) <= before  # those of other feeds may end meanwhile
+
+
+def test_targets_describe_the_question(policy, questions, data):
+    label = data.label[data.parts["grpo"]]
+    for _, batch in zip(range(5), questions(), strict=False):
+        target = jax.tree.map(np.asarray, batch.target)
+        assert (target.asked.sum(1) == 1).all()
+        assert (target.label[target.asked] >= 0).all()
+        assert (target.levels == [3, 3, 3, 9]).all()
+        assert (target.ordinal == [True, True, True, False]).all()
+        for ids, mask, asked, row in zip(batch.ids, batch.mask, target.asked, target.label, strict=True):
+            a = attribute_of(policy, ids)
+            assert asked[a]
+            assert row[a] in label[:, a]
+            assert np.array_equal(mask, policy.layout.mask[a])
+
+
+def test_a_question_is_felt_by_the_streams_that_it_says(policy, features, data):
+    label, rows, attribute = data.label[data.parts["grpo"]], np.array([2, 0]), np.array([1, 3])
+    streams = np.array([[True, False, False, True], [False, True, True, False]])
+    batch = question_batch(policy, features, label, rows, attribute, streams)
+    assert np.array_equal(batch.features.stream_mask, streams & features.stream_mask[rows])
+    assert np.array_equal(batch.target.streams, streams)
+    assert not batch.ordered.any()  # a press shows its peak in whatever order
+    assert np.array_equal(batch.features.touch, features.touch[rows])
+    assert np.array_equal(take(features, rows).view, features.view[rows])

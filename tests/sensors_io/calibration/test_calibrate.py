@@ -104,3 +104,21 @@ def test_presses_that_cannot_calibrate_are_refused(presses: BallPresses) -> None
     ):
         wrong = dataclasses.replace(presses, **change)
         refused(CalibrationError, said, calibrate, wrong, names(wrong), "x", QUICK)
+
+
+@pytest.mark.slow
+def test_a_picture_without_contact_is_left_out_and_named(presses: BallPresses) -> None:
+    blank = dataclasses.replace(presses, pictures=np.concatenate([presses.pictures, presses.background[None]]))
+    _, report = calibrate(blank, names(blank), "x", QUICK)
+    assert [(press.name, "shows no contact" in press.reason) for press in report.left_out] == [("press 12", True)]
+    assert len(report.kept) == 12
+
+
+def test_a_changed_calibration_is_refused(real: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    with np.load(real) as file:
+        arrays = dict(file)
+    arrays["weights"] = arrays["weights"] * 2
+    np.savez(tmp_path / "changed.npz", **arrays)
+    refused(CalibrationError, "was changed", Calibration.load, tmp_path / "changed.npz")
+    (tmp_path / "text.npz").write_text("no zip")
+    refused(CalibrationError, "is no calibration", Calibration.load, tmp_path / "text.npz")

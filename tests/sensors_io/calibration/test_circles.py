@@ -1,5 +1,7 @@
 """Circles that are found without labels, by known touches."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -26,3 +28,14 @@ def test_optics_of_some_presses_find_the_others(presses: BallPresses) -> None:
     optics = find_circles(presses.chosen(train)).optics
     found = align_circles(presses.chosen(rest), optics)
     np.testing.assert_allclose(found.touches.stacked(), TOUCHES[rest], atol=0.5)
+
+
+@pytest.mark.slow
+def test_neither_a_speck_nor_drifting_lamps_move_a_circle(presses: BallPresses) -> None:
+    brighter = np.clip(presses.pictures.astype(int) + np.array([12, -8, 5]), 0, 255).astype(np.uint8)
+    found = find_circles(dataclasses.replace(presses, pictures=brighter))
+    np.testing.assert_allclose(found.touches.stacked(), TOUCHES, atol=0.5)
+    specked = presses.pictures.copy()
+    specked[:, 30:34, 60:64] = 255
+    found = find_circles(dataclasses.replace(presses, pictures=specked))
+    np.testing.assert_allclose(np.median(np.abs(found.touches.stacked() - TOUCHES), 0), 0, atol=0.4)

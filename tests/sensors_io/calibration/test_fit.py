@@ -6,8 +6,9 @@ import pytest
 from sensors_io.calibration.circles import find_circles
 from sensors_io.calibration.fit import fit_map, recentre
 from sensors_io.calibration.presses import BallPresses, Touches
-from sensors_io.calibration.validate import cross_validate, score_ball
+from sensors_io.calibration.validate import cross_validate, score_ball, score_presses
 from sensors_io.fields.slopes import ColourMap, SlopeReader
+from sensors_io.fields.types import Calibration
 from tests.sensors_io.calibration.synthetic import press_ball, spread_touches
 
 TOUCHES = spread_touches(14)
@@ -56,3 +57,13 @@ def test_a_sphere_scores_nothing_and_a_wrong_one_its_error() -> None:
     assert rmse < 1e-6
     assert share == pytest.approx(0, abs=1e-9)
     assert score_ball(cap(3.3), touch, 3.0, 0.15)[1] == pytest.approx(0.1, abs=1e-6)
+
+
+def test_a_ball_of_another_diameter_comes_out(presses: BallPresses, colours: ColourMap) -> None:
+    made = Calibration(
+        sensor="x", background=presses.background, mm_per_px=presses.mm_per_px, colours=colours, made_from={}
+    )
+    touches = np.array([[40.0, 40.0, 14.0], [65.0, 38.0, 16.0]])
+    errors = score_presses(made, press_ball(touches, radius_mm=5.0), touches)
+    assert np.abs(errors.radius_share).max() < 0.08
+    assert errors.depth_um.max() < 20

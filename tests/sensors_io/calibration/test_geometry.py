@@ -1,5 +1,6 @@
 """Lens and scale of made pictures and of a real pin board (9DTact)."""
 
+import json
 import pathlib
 
 import cv2
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 from sensors_io.calibration.geometry import CameraGeometry, GeometryError, find_pins, fit_geometry
+from sensors_io.json_files import read_json
 from tests.sensors_io.checks import refused
 
 BOARD = pathlib.Path(__file__).parents[2] / "data" / "9DTact"
@@ -96,3 +98,27 @@ def test_bad_boards_are_refused():
     refused(GeometryError, "must be ≥ 4×4", fit_geometry, points[:3], pitch_mm=1.6, size_px=SIZE)
     with pytest.raises(GeometryError, match="measure the geometry in this mode"):
         lens().view(mm_per_px=0.1, size_px=(10, 10))(empty[:-1])
+
+
+def test_no_flipped_bit_of_a_geometry_reads_as_another(tmp_path):
+    path = tmp_path / "g.json"
+    lens().save(path)
+    content, whole = path.read_bytes(), CameraGeometry.load(path).hash
+    for bit in range(0, 8 * len(content), 3):
+        flipped = bytearray(content)
+        flipped[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(flipped)
+        try:
+            assert CameraGeometry.load(path).hash == whole, bit
+        except GeometryError:
+            continue
+
+
+@pytest.mark.parametrize(
+    "change", [{"radial": [float("nan"), 0]}, {"homography": [[1, 0], [0, 1]]}, {"size_px": ["a", 1]}]
+)
+def test_a_file_of_another_geometry_is_named(tmp_path, change):
+    path = tmp_path / "g.json"
+    lens().save(path)
+    path.write_text(json.dumps(read_json(path) | change))
+    refused(GeometryError, "is no geometry", CameraGeometry.load, path)

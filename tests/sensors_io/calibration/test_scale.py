@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from sensors_io.calibration.geometry import GeometryError
-from sensors_io.calibration.scale import approach_mm, contact_radius_mm, scale_from_presses
+from sensors_io.calibration.scale import approach_mm, contact_radius_mm, measure_scale, scale_from_presses
 from sensors_io.layer import Layer
+from tests.sensors_io.calibration.synthetic import press_ball, spread_touches
 from tests.sensors_io.checks import refused
 
 THICK = Layer(modulus_mpa=1.0, poisson=0.48, thickness_mm=1e4)
@@ -42,3 +43,14 @@ def test_contact_circles_at_known_depths_give_the_scale() -> None:
     assert noisy.mm_per_px == pytest.approx(0.05, abs=3 * noisy.error)
     with pytest.raises(GeometryError, match="3 circles and 4 depths"):
         scale_from_presses(radius[:3], depth, ball_diameter_mm=6.0, gel=GEL)
+
+
+@pytest.mark.slow
+def test_pictures_give_the_scale() -> None:
+    """A pitch of 0.11 mm, looked for from 0.151."""
+    touches = spread_touches(8)
+    presses = press_ball(touches, mm_per_px=0.11)
+    depth = np.array([approach_mm(0.11 * radius, 3.0, THICK) for radius in touches[:, 2]])
+    scale, circles = measure_scale(presses.pictures, presses.background, depth, ball_diameter_mm=6.0, gel=THICK)
+    assert scale.mm_per_px == pytest.approx(0.11, rel=0.03)
+    assert np.median(np.abs(circles.touches.radius_px / touches[:, 2] - 1)) < 0.05

@@ -3,10 +3,13 @@
 import numpy as np
 import pytest
 
+from sensors_io import cards
 from sensors_io.__main__ import main
 from sensors_io.cards import replace_cards
 from sensors_io.records import RecordStore
+from sensors_io.schema import SchemaError
 from tests.sensors_io import fakes
+from tests.sensors_io.checks import refused
 
 
 def label(root, table, *more):
@@ -75,3 +78,18 @@ def test_a_bad_table_is_answered_and_changes_nothing(root, capsys, table, messag
     assert label(root, table) == 1
     assert message in capsys.readouterr().err
     assert RecordStore(root).digest == before
+
+
+def test_a_kill_before_the_index_leaves_the_old_cards(root, monkeypatch):
+    def killed(self, path):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cards.Index, "write", killed)
+    with pytest.raises(KeyboardInterrupt):
+        replace_cards(root, [fakes.card(0)])
+    monkeypatch.undo()
+    assert RecordStore(root).objects["object_0"].split == "unlabelled"
+    assert label(root, "object_id,hardness\nobject_0,1\n") == 0
+    assert RecordStore(root).objects["object_0"].labels == {"hardness": 1}
+    said = r"object_id is 'object_7': .* holds object_0, object_1"
+    refused(SchemaError, said, replace_cards, root, [fakes.card(7)])

@@ -4,6 +4,7 @@ import os
 import pathlib
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 from sensors_io import __main__ as cli
+from sensors_io.calibration.geometry import CameraGeometry
 from sensors_io.offsets import Offset, Offsets
 from sensors_io.poses import ForceZero
 from sensors_io.records import RecordStore
@@ -148,3 +150,65 @@ def test_sync_and_its_check(tmp_path, capsys):
     Offsets(reference="tac3d", sensors={"gelsight_mini": off}).save(tmp_path / "off.json")
     assert run("sync", "--seconds", 4, "--check", tmp_path / "off.json", *bench) == 1
     assert "measure again" in capsys.readouterr().out
+
+
+def test_view_extracts_fields_of_a_camera(tmp_path, capsys):
+    """Presses of a real Mini without calibration: no depth and no shear can be told, and the view says so."""
+    gelslam = ROOT / "tests" / "data" / "gelslam"
+    args = ["view", "--port", "0", "--seconds", "0.3", "--background", gelslam / "background.png", "replay"]
+    assert cli.main([*map(str, args), "--path", str(gelslam), "--seconds", "30"]) == 0
+    assert "not shown: depth_mm: without a calibration" in capsys.readouterr().out
+
+
+def test_devices_says_what_is_absent(capsys):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    assert cli.main(["devices", "--wait-s", "0.1", "--netft-host", "127.0.0.1", "--tac3d-port", str(port)]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "nothing heard" in said
+    assert "does not answer" in said
+
+
+def test_a_pin_board_gives_a_geometry(tmp_path):
+    board = ROOT / "tests" / "data" / "9DTact"
+    pins = ["--background", board / "board_ref.png", "--rows", 7, "--columns", 9]
+    args = ["geometry", board / "board_sample.png", *pins]
+    assert run(*args, "--pitch-mm", 2.5, "--out", tmp_path / "g.json") == 0
+    assert CameraGeometry.load(tmp_path / "g.json").held_out_mm < 0.07
+    assert run(*args, "--pitch-mm", -1, "--out", tmp_path / "h.json") == 1
+    assert not (tmp_path / "h.json").exists()
+
+
+def test_two_sensors_are_recorded_into_one_contact(tmp_path, press):
+    """Each at its own rate, one offset taken off, with a page beside the recording."""
+    out, sync = tmp_path / "records", tmp_path / "s.json"
+    late = Offset(late_s=0.1, spread_s=0.001, events=5, by="taps")
+    Offsets(reference="netft", sensors={"gelsight_mini": late}).save(sync)
+    camera = ["replay", "--path", pictures(tmp_path / "film", range(40, 80)), "--rate-hz", 50]
+    bench = [*camera, "+", "replay", "--path", press]
+    assert run("record", "--out", out, "--object-id", "cup", "--free-s", 0.4, "--sync", sync, "--port", 0, *bench) == 0
+    made = RecordStore(out).contact(0)
+    assert list(made) == ["gelsight_mini", "tac3d"]
+    assert 12 <= len(made["gelsight_mini"]) <= 25
+    assert 25 <= len(made["tac3d"]) <= 45
+    starts = [s.host_time_ns[0] for s in made.values()]
+    assert -0.15e9 < starts[0] - starts[1] < -0.05e9
+    assert made["gelsight_mini"].camera["recording"]["late_s"] == 0.1
+
+
+def test_the_object_is_looked_at_before_it_is_touched(tmp_path, press):
+    """A replayed RGB-D camera: 16-bit depth, and 20 mm at 300 mm seen with f = 30 px."""
+    folder = tmp_path / "rgbd"
+    pictures(folder / "colour", [90, 91])
+    (folder / "depth").mkdir()
+    cv2.imwrite(str(folder / "depth" / "0.png"), np.full((24, 32), 600, np.uint16))
+    view = ["rgbd", "--replay", folder, "--width", 32, "--height", 24, "--fx", 30, "--fy", 30, "--cx", 16, "--cy", 12]
+    out = tmp_path / "records"
+    args = ["record", "--out", out, "--object-id", "cup", "--free-s", 0.2, "--contact-mm", 0, 0, 300, "replay"]
+    assert run(*args, "--path", press, "+", *view, "--depth-unit-mm", 0.5) == 0
+    store = RecordStore(out)
+    assert store.objects["cup"].view[0, 0].tolist() == [90, 90, 90]
+    assert store.objects["cup"].view_depth_mm[0, 0] == 300
+    assert store.contact(0)["tac3d"].contact_region_px == (15, 11, 2, 2)
+    away = [*args[:3], "--object-id", "mug", *args[5:8], 0, 0, -300, "replay", "--path", press, "+", *view]
+    assert run(*away) == 1

@@ -9,9 +9,11 @@ import sys
 import time
 import venv
 
+import numpy as np
 import pytest
 
 from sensors_io.devices import bridge
+from sensors_io.devices.bridge_server import pack
 from sensors_io.devices.errors import DeviceDataError, DeviceLostError, DeviceNotFoundError
 from tests.sensors_io.checks import refused
 
@@ -24,7 +26,7 @@ def config(serial, **rest):
 
 def test_a_failing_sdk_says_its_last_words(monkeypatch, request):
     monkeypatch.chdir(request.config.rootpath)
-    with pytest.raises(DeviceNotFoundError, match="no such sensor"), config("1").open():
+    with pytest.raises(DeviceNotFoundError, match="no such sensor"), config("fails").open():
         pass
     with pytest.raises(DeviceNotFoundError, match="does not start"), bridge.BridgeConfig(python="/nowhere").open():
         pass
@@ -165,3 +167,54 @@ def test_a_killed_reader_takes_its_server_along(vendors, request):
     while server.exists() and time.monotonic() < deadline:
         time.sleep(0.02)
     assert not server.exists()
+
+
+def split(frame):
+    prefix = bridge.bridge_server.PREFIX
+    _, header, _ = prefix.unpack_from(frame)
+    return frame[prefix.size : prefix.size + header], frame[prefix.size + header :]
+
+
+def test_frames_cross_though_the_sdk_prints(monkeypatch, request):
+    monkeypatch.chdir(request.config.rootpath)
+    with config("3").open() as device:
+        samples = [device.read(10.0) for _ in range(3)]
+        refused(DeviceLostError, r"has ended.*vendor banner", device.read, 10.0)
+    assert [s.index for s in samples] == [0, 1, 2]
+    assert samples[1].frame[0, 0].tolist() == [200, 1, 1]
+    assert samples[2].arrays["depth_mm"].dtype == np.float32
+    assert samples[2].arrays["depth_mm"][0, 0] == 1.0
+    assert samples[0].arrays["force_n"].tolist() == [0, 1, 2]
+    assert samples[0].arrays["moment_nmm"].tolist() == [3, 4, 5]
+    now_ns = time.monotonic_ns()
+    assert all(0 <= now_ns - s.host_time_ns < 60e9 for s in samples)
+
+
+def test_an_endless_sdk_ends_with_its_reader(monkeypatch, request):
+    monkeypatch.chdir(request.config.rootpath)
+    with config("1000000").open() as device:
+        device.read(10.0)
+        process = device._process
+    assert process.poll() is not None
+
+
+def test_any_array_comes_back():
+    arrays = {"a": np.arange(6, dtype=np.int16).reshape(2, 3), "b": np.array([True, False])}
+    described, found = bridge.unpack(*split(pack(7, 99, "S1", arrays)))
+    assert (described["number"], described["stamp_ns"], described["serial"]) == (7, 99, "S1")
+    for name, a in arrays.items():
+        np.testing.assert_array_equal(found[name], a)
+
+
+def test_a_python_without_the_sdk_is_named(vendors):
+    lacking = bridge.BridgeConfig(python=vendors["without"])
+    with pytest.raises(DeviceNotFoundError, match=r"without/bin/python.* cannot import xensesdk"), lacking.open():
+        pass
+
+
+def test_last_words_that_come_after_the_end_of_answers_are_heard(tmp_path):
+    late = tmp_path / "python"
+    late.write_text("#!/bin/sh\nexec 1>&-\nsleep .2\necho no such sensor >&2\n")
+    late.chmod(0o755)
+    with pytest.raises(DeviceNotFoundError, match="has ended; it said: no such sensor"):
+        bridge.BridgeConfig(python=late).open().__enter__()

@@ -1,13 +1,21 @@
 """Messages that break a protocol end no stream and are counted once."""
 
+import struct
+import time
+
 import numpy as np
 import pytest
 
 from sensors_io.clock import JumpingClock
+from sensors_io.devices import tac3d_messages
+from sensors_io.devices.errors import WrongRateWarning
 from sensors_io.devices.intake import Intake
 from sensors_io.devices.reader import Reader
+from sensors_io.devices.replay import Replay
+from sensors_io.devices.sources import Tac3dRecording
 from tests.sensors_io.devices.fakes import sample, sent
-from tests.sensors_io.devices.test_tac3d import datagrams, listening, pushed
+from tests.sensors_io.devices.test_netft import record, sensor
+from tests.sensors_io.devices.test_tac3d import datagrams, layout, listening, pushed
 
 FINE = pushed([0, 0, -1], [0, 0, -0.1])
 
@@ -42,3 +50,50 @@ def test_a_broken_sample_is_lost_once():
     for index in (0, 1, None, 3, 6):
         intake.broke() if index is None else intake.offer(sample(index))
     assert (intake.counts.missing, intake.counts.broken, intake.counts.lost) == (2, 1, 3)
+
+
+def test_messages_of_a_program_that_still_starts_are_no_samples(vendor):
+    sender, port = vendor
+    starting = message({**FINE, "InitializeProgress": np.array([[40.0]])})
+    with sent(sender, starting, message()), listening(port) as device:
+        assert {device.read(5.0).index % 2 for _ in range(4)} == {0}
+
+
+def test_two_programs_on_one_port_do_not_mix():
+    assembler = tac3d_messages.Assembler()
+    a, b = datagrams(FINE, number=1, serial="A"), datagrams(FINE, number=1, serial="B")
+    found = [assembler.add(d, s) for pair in zip(a, b, strict=True) for d, s in zip(pair, "ab", strict=True)]
+    serials = [tac3d_messages.Tac3dDecoder().decode(*whole).serial for whole in found if whole is not None]
+    assert serials == ["A", "B"]
+
+
+def test_a_layout_of_spaces_is_read_in_linear_time():
+    spaces = layout({"3D_ResultantForce": np.ones((1, 3))}).replace(b'msg: ""', b"msg:" + b" " * 64_500 + b"x")
+    began = time.process_time()
+    assert tac3d_messages.Tac3dDecoder().decode(spaces, struct.pack("<3d", 1, 2, 3)).note == "x"
+    assert time.process_time() - began < 1.0
+
+
+def test_a_repeated_replay_keeps_the_gaps_of_the_recording(tmp_path):
+    np.savez(tmp_path / "a.npz", index=[3, 4, 7], sendTimestamp=[0.0, 0.03, 0.12])
+    with Replay(Tac3dRecording(path=tmp_path / "a.npz"), seconds=0.4, clock=JumpingClock()) as device:
+        assert [device.read(1.0).index for _ in range(6)] == [3, 4, 7, 8, 9, 12]
+
+
+def test_a_wrong_rate_of_a_force_sensor_warns_and_leaves_its_stamps_out():
+    class Slow(list):
+        """Records every 10 ms: 100 a second."""
+
+        def __iter__(self):
+            for datagram in super().__iter__():
+                time.sleep(0.01)
+                yield datagram
+
+    with (
+        sensor(Slow(record(k, *[0] * 6) for k in range(60))) as (config, _),
+        config.open() as device,
+        pytest.warns(WrongRateWarning, match="rate_hz is 1000"),
+    ):
+        stamps = [device.read(5.0).device_time_ns for _ in range(60)]
+    assert stamps[0] == 0
+    assert stamps[-5:] == [None] * 5

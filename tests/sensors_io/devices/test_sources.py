@@ -78,3 +78,14 @@ def test_faults_are_checked():
         Faults,
         disconnects=(Disconnect(at_s=5, for_s=2), Disconnect(at_s=6, for_s=1)),
     )
+
+
+def test_a_video_at_its_own_rate(tmp_path):
+    path = tmp_path / "a.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"FFV1"), 20.0, (16, 12))
+    for n in range(4):
+        writer.write(np.full((12, 16, 3), 40 * n, np.uint8))
+    writer.release()
+    samples = everything(ReplayConfig(path=path).open(JumpingClock()))
+    assert [int(s.frame[0, 0, 0]) for s in samples] == [0, 40, 80, 120]
+    assert samples[3].host_time_ns == 150_000_000

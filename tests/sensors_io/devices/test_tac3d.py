@@ -172,3 +172,18 @@ def test_silence_and_a_taken_port_are_named(vendor):
         refused(DeviceNotFoundError, "cannot be listened on", listening(port).__enter__)
     refused(DeviceLostError, "not open", lambda: listening(port).read(0.1))
     refused(DeviceLostError, "not open", lambda: listening(port).take_zero())
+
+
+def test_a_layout_of_another_shape_is_learnt_anew():
+    decoder = tac3d_messages.Tac3dDecoder()
+    for arrays in (matrices(), {"3D_ResultantForce": np.ones((1, 3))}):
+        data = b"".join(a.tobytes() for a in arrays.values())
+        assert decoder.decode(layout(arrays), data).matrices.keys() == arrays.keys()
+
+
+def test_an_incomplete_recording_is_refused(tmp_path):
+    refused(DeviceNotFoundError, "neither a folder", tac3d_messages.load_recording, tmp_path / "nowhere")
+    np.savez(tmp_path / "a.npz", index=np.arange(3))
+    refused(DeviceDataError, "sendTimestamp must be among them", tac3d_messages.load_recording, tmp_path / "a.npz")
+    np.savez(tmp_path / "b.npz", index=np.arange(3), sendTimestamp=np.arange(2.0))
+    refused(DeviceDataError, "one length", tac3d_messages.load_recording, tmp_path / "b.npz")

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from sensors_io.devices.cameras import CameraInfo, find_cameras
-from sensors_io.devices.errors import DeviceLostError, DeviceNotFoundError, SettingRefusedWarning
+from sensors_io.devices.errors import DeviceLostError, DeviceNotFoundError, DeviceTimeoutError, SettingRefusedWarning
 from sensors_io.devices.reader import Reader
-from sensors_io.devices.uvc import Lock, Uvc, UvcConfig
+from sensors_io.devices.uvc import Lock, Uvc, UvcConfig, wait_for_frame
 from tests.sensors_io.checks import refused
 
 
@@ -171,3 +171,38 @@ def test_configs_are_checked():
     refused(ValueError, "must have four letters", UvcConfig, pixel_format="MJPEG")
     refused(ValueError, "must both be given", UvcConfig, frame_width=4)
     refused(ValueError, "mm_per_px is 0.0", UvcConfig, mm_per_px=0.0)
+
+
+def test_frames_are_cropped_and_shrunk_after_the_stamp():
+    with camera(FakeCapture(), border_share=0.25, frame_width=2, frame_height=2) as device:
+        assert device.read(1.0).frame.shape == (2, 2, 3)
+
+
+def test_a_camera_that_stalls_is_a_timeout_when_it_is_told_to():
+    with camera(FakeCapture(stalls_after=0)) as device:
+        began = time.monotonic()
+        refused(DeviceTimeoutError, r"no frame in 0\.05 s", device.read, 0.05)
+    assert time.monotonic() - began < 1
+
+
+def test_opencv_has_the_wait_and_takes_what_it_is_given(tmp_path):
+    """A video file gets as far as the question what kind of camera it is; a closed camera is left to `grab`."""
+    path = str(tmp_path / "a.avi")
+    writer = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"FFV1"), 20.0, (16, 12))
+    writer.write(np.zeros((12, 16, 3), np.uint8))
+    writer.release()
+    capture = cv2.VideoCapture(path)
+    refused(cv2.error, "V4L", wait_for_frame, capture, 0.01)
+    capture.release()
+    assert wait_for_frame(capture, 0.01)
+
+
+def test_a_camera_that_does_not_open_or_has_no_such_mode_is_named():
+    refused(DeviceNotFoundError, "does not open", lambda: camera(FakeCapture(opens=False)).__enter__())
+
+    class Fixed(FakeCapture):
+        def set(self, prop, value):
+            return prop not in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT) and super().set(prop, value)
+
+    with pytest.raises(DeviceNotFoundError, match="no mode of 640×480, it offers 8×6"):
+        camera(Fixed(), width=640, height=480).__enter__()

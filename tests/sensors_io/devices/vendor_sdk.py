@@ -1,8 +1,20 @@
-"""A vendor's SDK whose sensor is absent.  Runs in the bridge's process."""
+"""What a vendor's SDK may do: print to standard output, give frames, fail.  Runs in the bridge's process."""
+
+import time
+
+import numpy as np
 
 
 def frames(serial):
-    """No frame; says why on standard output too."""
+    """Three frames, or as many as the serial says; one that says "fails" raises."""
     print("vendor banner on standard output", flush=True)  # noqa: T201
-    raise RuntimeError("no such sensor")
-    yield
+    if serial == "fails":
+        raise RuntimeError("no such sensor")
+    for n in range(int(serial or 3)):
+        picture = np.full((2, 3, 3), n, np.uint8)
+        picture[..., 2] = 200  # red, in the SDK's BGR
+        yield (
+            time.monotonic_ns(),
+            n,
+            {"frame_bgr": picture, "depth_mm": np.full((2, 3), 0.5 * n), "resultant": np.arange(6.0), "shear_mm": None},
+        )

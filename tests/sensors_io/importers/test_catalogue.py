@@ -7,12 +7,21 @@ import numpy as np
 import pytest
 
 from sensors_io.importers.catalogue import Catalogue, Listed, Taken, fingerprint, import_catalogue
-from sensors_io.importers.keep import ImportConfig, ImportSourceError, Keep, Skip, UnreadableError
+from sensors_io.importers.estimate_modulus import list_estimate_modulus
+from sensors_io.importers.feelanyforce import FeelAnyForceConfig, list_feelanyforce
+from sensors_io.importers.keep import ImportConfig, ImportSourceError, Keep, Shares, Skip, UnreadableError
+from sensors_io.importers.octopi import list_octopi
+from sensors_io.importers.tac3d import list_tac3d
+from sensors_io.importers.tacquad import list_tacquad
+from sensors_io.importers.touch_and_go import list_touch_and_go
+from sensors_io.importers.tvl import list_tvl
+from sensors_io.importers.vtv150k import VTVConfig, list_vtv150k
+from sensors_io.importers.ycb_slide import list_ycb_slide
 from sensors_io.records import RecordsExistError, RecordStore
 from sensors_io.schema import ATTRIBUTES, ContactKey
 from tests.sensors_io import fakes
 from tests.sensors_io.checks import refused
-from tests.sensors_io.importers.films import imported
+from tests.sensors_io.importers.films import EVERYTHING, imported
 
 
 def take(n, key):
@@ -105,3 +114,21 @@ def test_bad_options_are_named():
     refused(ImportSourceError, "stride is 0: must be ≥ 1; raise it", ImportConfig, stride=0)
     refused(ImportSourceError, "height is -1: must be ≥ 0", ImportConfig, height=-1)
     refused(ImportSourceError, "max_frames is -1", ImportConfig, max_frames=-1)
+
+
+@pytest.mark.parametrize(
+    ("listing", "config", "expected"),
+    [
+        (list_estimate_modulus, EVERYTHING, r"<object>_<n>.avi with <object>_<n>_forces.pkl"),
+        (list_feelanyforce, FeelAnyForceConfig(), r"<table>.csv with the columns tactile, depth, FT"),
+        (list_octopi, Keep(), r"<sample>/data.json and <sample>/tactile"),
+        (list_tac3d, Shares(), r"<name>_<serial>.npz"),
+        (list_tacquad, EVERYTHING, r"one of contact_indoor.csv, .* with its data_indoor"),
+        (list_touch_and_go, EVERYTHING, r"one of label.txt, .* and dataset/<session>/gelsight_frame"),
+        (list_tvl, EVERYTHING, r"train.csv or test.csv, in it or in data1"),
+        (list_vtv150k, VTVConfig(sensor="digit"), r"<object>_<n>.mp4"),
+        (list_ycb_slide, EVERYTHING, r"<object>/dataset_<k>/frames/frame_<7 digits>.jpg"),
+    ],
+)
+def test_a_wrong_directory_says_what_was_expected(tmp_path, listing, config, expected):
+    refused(ImportSourceError, f"expected {expected}", listing, tmp_path, config)

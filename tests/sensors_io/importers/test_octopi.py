@@ -56,3 +56,21 @@ def test_samples_become_records(source, tmp_path):
 
 def test_ratings_are_cut_into_thirds():
     assert [level_of(r) for r in (0, 3.33, 3.34, 6.66, 6.67, 10)] == [0, 0, 1, 1, 2, 2]
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        ("{", "data.json: "),
+        ({"object": "nothing"}, "data.json: 'object_id'"),
+        (POTATO | {"split": "dev"}, "split is 'dev'"),
+        (POTATO | {"properties": {"hardness": 11}}, "rating is 11.0: must lie in 0..10"),
+        (POTATO | {"properties": {"hardness": 1.0}}, "contradicts an earlier sample of potato"),
+    ],
+)
+def test_a_sample_without_a_usable_object_is_skipped(source, data, reason):
+    sample(source, "physiclear_99", data)
+    catalogue = list_octopi(source, EVERYTHING)
+    assert len(catalogue.contacts) == 3
+    assert [skip.name for skip in catalogue.skipped] == ["physiclear_99"]
+    assert reason in catalogue.skipped[0].reason

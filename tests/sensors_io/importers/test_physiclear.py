@@ -1,12 +1,15 @@
 """The PhysiCLeAR importer: what comes in, and a named error or a listed skip for everything that does not."""
 
+import os
+import pathlib
+
 import numpy as np
 import pytest
 
 from sensors_io.importers.keep import ImportSourceError
 from sensors_io.importers.physiclear import PhysiclearConfig, import_physiclear, read_labels
 from sensors_io.records import RecordStore
-from sensors_io.schema import MATERIALS, UNKNOWN
+from sensors_io.schema import ATTRIBUTES, MATERIALS, UNKNOWN
 from tests.sensors_io.checks import refused
 from tests.sensors_io.importers.films import entry, film, folder, labels
 
@@ -83,3 +86,19 @@ BALL = entry("ball")
 def test_labels_that_cannot_be_used_are_named(tmp_path, items, message):
     labels(tmp_path, *items) if items else (tmp_path / "labels.json").write_text("{")
     refused(ImportSourceError, message, read_labels, tmp_path / "labels.json")
+
+
+@pytest.mark.skipif("TOUCHR1_PHYSICLEAR" not in os.environ, reason="TOUCHR1_PHYSICLEAR does not name the recordings")
+def test_the_real_recordings(tmp_path):
+    source = pathlib.Path(os.environ["TOUCHR1_PHYSICLEAR"])
+    report = import_physiclear(source, tmp_path / "out", config=PhysiclearConfig(height=60, max_frames=8))
+    assert report.contacts == 437
+    assert report.skipped == report.unlabelled == ()
+    store = RecordStore(tmp_path / "out")
+    objects = {split: {k.object_id for k in map(store.contacts.__getitem__, store.contacts_of_split(split))}
+               for split in ("train", "val", "test", "unlabelled")}  # fmt: skip
+    assert {split: len(ids) for split, ids in objects.items()} == {"train": 48, "val": 7, "test": 12, "unlabelled": 13}
+    assert len(set.union(*objects.values())) == 80
+    for attribute in ATTRIBUTES[:3]:
+        for split in ("train", "test"):
+            assert {store.objects[name].labels[attribute] for name in objects[split]} == {0, 1, 2}

@@ -1,5 +1,8 @@
 """Tac3D recordings: the grid is turned into image order, signs are kept, the counter's gaps are flagged."""
 
+import os
+import pathlib
+
 import numpy as np
 import pytest
 
@@ -77,3 +80,33 @@ def test_gaps_of_the_counter_are_flagged_and_counted(tmp_path):
 )
 def test_another_layout_is_refused(tmp_path, changes, reason):
     refused(ImportSourceError, reason, read, write(tmp_path / "in", **changes), tmp_path / "out")
+
+
+def test_receive_times_are_host_times_where_they_are_stored(tmp_path):
+    write(tmp_path / "in", "a_S1")
+    write(tmp_path / "in", "b_S2", recvTimestamp=np.array([0.04, 0.07, 0.52]))
+    write(tmp_path / "in", "c_S3", recvTimestamp=np.array([0.04, 0.03, 0.52]))
+    report, store = read(tmp_path / "in", tmp_path / "out")
+    sent, received = (store.contact(i)["tac3d"] for i in range(2))
+    np.testing.assert_array_equal(sent.host_time_ns, sent.device_time_ns)
+    assert received.host_time_ns.tolist() == [40_000_000, 70_000_000, 520_000_000]
+    np.testing.assert_array_equal(received.force_time_ns, received.device_time_ns)
+    assert report.skipped[0].reason == "has receive times that run backwards"
+
+
+def test_a_frame_that_is_not_finite_is_left_out(tmp_path):
+    arrays = recording()
+    arrays["3D_ResultantForce"][1, 0, 2] = np.nan
+    report, store = read(write(tmp_path / "in", **arrays), tmp_path / "out")
+    assert [skip.name for skip in report.skipped] == ["example_1_AD2-0065L.npz, frame 1"]
+    assert store.contact(0)["tac3d"].flags.tolist() == [0, int(Flag.TIME_GAP)]
+
+
+@pytest.mark.skipif("TOUCHR1_TAC3D" not in os.environ, reason="TOUCHR1_TAC3D does not name the vendor's recordings")
+def test_the_real_recordings(tmp_path):
+    _, store = read(pathlib.Path(os.environ["TOUCHR1_TAC3D"]), tmp_path)
+    missing = {k.object_id: store.contact(i)["tac3d"].camera["missing_frames"] for i, k in enumerate(store.contacts)}
+    assert missing == {"example_1_AD2-0065L": 9, "example_2_HDL1-GWH0021": 61}
+    hardest = store.contact(0)["tac3d"].force_n[:, 2].argmin()
+    assert store.contact(0)["tac3d"].force_n[hardest, 2] == pytest.approx(-7.694, abs=1e-3)
+    assert store.contact(0)["tac3d"].depth_mm[hardest].max() == pytest.approx(1.344, abs=1e-3)

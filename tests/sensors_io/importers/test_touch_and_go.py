@@ -62,3 +62,13 @@ def test_lines_and_frames_that_say_nothing_certain_are_skipped(source, tmp_path)
 def test_a_pause_a_class_or_a_session_ends_a_touch():
     classes = {("a", 1): 0, ("a", 2): 0, ("a", 17): 0, ("a", 33): 0, ("a", 34): 1, ("b", 35): 1}
     assert touches(classes) == [("a", 0, [1, 2, 17]), ("a", 0, [33]), ("a", 1, [34]), ("b", 1, [35])]
+
+
+def test_recorded_times_are_used_where_they_are(source, tmp_path):
+    np.save(source / "dataset" / FIRST / "time2.npy", 1647.0 + np.arange(62) ** 2 / 100)
+    np.save(source / "dataset" / SECOND / "time2.npy", np.arange(2.0))
+    report, store = imported(list_touch_and_go(source, EVERYTHING), tmp_path / "out")
+    sequence = store.contact(0)["gelsight"]
+    np.testing.assert_allclose(sequence.host_time_ns, [250_000_000, 360_000_000, 490_000_000], atol=100)
+    assert sequence.camera["clock"] == "time2.npy"
+    assert "time2.npy has 2 times and frame 2 is listed" in {skip.reason for skip in report.skipped}

@@ -2,6 +2,7 @@
 
 import tracemalloc
 
+import cv2
 import numpy as np
 import pytest
 
@@ -64,3 +65,38 @@ def test_a_long_video_takes_the_memory_of_the_frames_that_are_kept(tmp_path):
     tracemalloc.stop()
     assert (len(video.frames), video.total, video.index[-1]) == (32, 600, 599)
     assert peak < 3 * video.frames.nbytes
+
+
+@pytest.mark.parametrize("data", [None, b"", b"no video at all" * 99])
+def test_broken_files_are_named(tmp_path, data):
+    path = tmp_path / "a.avi"
+    if data is not None:
+        path.write_bytes(data)
+    refused(VideoError, "does not open as a video", read_video, path, Keep(**WHOLE))
+
+
+@pytest.mark.parametrize(
+    ("stated", "message"),
+    [
+        ({cv2.CAP_PROP_FPS: 0.0}, "states a frame rate of 0.0"),
+        ({cv2.CAP_PROP_FPS: float("nan")}, "states a frame rate of nan"),
+        ({cv2.CAP_PROP_FRAME_COUNT: 13.0}, "is cut off: 12 of 13 frames"),
+    ],
+)
+def test_what_the_container_states_is_checked(tmp_path, monkeypatch, stated, message):
+    film(tmp_path / "a.avi", 12)
+
+    opened = cv2.VideoCapture
+
+    class Capture:  # not a subclass: OpenCV's own class does not survive being one
+        def __init__(self, name):
+            self.capture = opened(name)
+
+        def __getattr__(self, name):
+            return getattr(self.capture, name)
+
+        def get(self, what):
+            return stated.get(what, self.capture.get(what))
+
+    monkeypatch.setattr(cv2, "VideoCapture", Capture)
+    refused(VideoError, message, lambda: read_video(tmp_path / "a.avi", Keep(**WHOLE)))

@@ -66,3 +66,10 @@ def test_clips_become_records_with_the_labels_of_their_table(clips, tmp_path):
 def test_what_does_not_fit_is_named_by_file_and_line(clips, row, said):
     with pytest.raises(LabelsError, match=rf"labels\.csv, {said}"):
         listed(clips, f"{TABLE}{row}\n")
+
+
+def test_a_folder_of_pictures_alone_is_a_clip(tmp_path):
+    for n in range(3):
+        picture(tmp_path / "press" / f"{n}.png")
+    _, store = imported(list_videos(tmp_path / "press", VideosConfig(sensor="digit")), tmp_path / "records")
+    assert [key.object_id for key in store.contacts] == ["press"]

@@ -6,9 +6,13 @@ import pathlib
 import numpy as np
 import pytest
 
+from sensors_io.devices.base import Sample
+from sensors_io.recording.assemble import assemble
+from sensors_io.recording.journal import JournalError, JournalWriter
 from sensors_io.recording.session import record_session
 from sensors_io.records import CorruptRecordsError, RecordStore
 from sensors_io.schema import Flag, SchemaError
+from tests.sensors_io.checks import refused
 from tests.sensors_io.recording.hand import Camera, Hand, Scale, Skin
 from tests.sensors_io.recording.test_session import CONFIG, SHORT
 
@@ -86,3 +90,33 @@ def test_journals_stay_until_their_contacts_were_read_back(tmp_path, monkeypatch
     with pytest.raises(CorruptRecordsError):
         record_session(tmp_path, SHORT, [Camera(hand)], Scale(hand), show=hand.show)
     assert len(list(pathlib.Path(tmp_path / ".journals").glob("*.journal"))) == 2
+
+
+class Heavy(Scale):
+    """A force sensor of a larger range: 70 N and 600 N mm are nothing unusual to it."""
+
+    def drain(self):
+        arrays = {"force_n": np.array([70.0, 0, 1.0], np.float32), "moment_nmm": np.array([0, 600, 0], np.float32)}
+        return [Sample(host_time_ns=s.host_time_ns, arrays=arrays) for s in super().drain()]
+
+
+def test_stamps_past_64_bits_leave_the_device_clock_out(tmp_path):
+    assert recorded(tmp_path, lambda s: dataclasses.replace(s, device_time_ns=10**20)).device_time_ns is None
+
+
+def test_forces_and_moments_past_16_bits_are_kept(tmp_path):
+    hand = Hand()
+    record_session(tmp_path, FREE, [Camera(hand)], Heavy(hand), show=hand.show)
+    made = RecordStore(tmp_path).contact(0)["gelsight_mini"]
+    np.testing.assert_array_equal(made.force_n[5], np.array([70, 0, 0], np.float32))
+    np.testing.assert_array_equal(made.moment_nmm[5], np.array([0, 600, 0], np.float32))
+    assert not (made.flags & np.uint32(Flag.INCOMPLETE)).any()
+
+
+def test_a_journal_of_another_layout_is_named(tmp_path):
+    """Its checksums hold, for another version wrote it."""
+    for k, plain in enumerate(({"streams": [{}]}, {"streams": [{"identity": {}}], "key": {}})):
+        with JournalWriter(tmp_path / f"{k}.journal") as journal:
+            journal.append("start", plain)
+            journal.append("frame", {"stream": 0, "time_ns": 1, "index": 0})
+        refused(JournalError, "entries of another layout", assemble, tmp_path / f"{k}.journal")

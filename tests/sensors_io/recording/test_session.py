@@ -9,13 +9,17 @@ import sys
 
 import cv2
 import numpy as np
+import pytest
 
+from sensors_io.devices.errors import DeviceLostError
 from sensors_io.force import ForceError, GravityModel
+from sensors_io.recording.assemble import assemble
 from sensors_io.recording.book import ATTEMPTS, ObjectView
 from sensors_io.recording.coach import CoachConfig, ContactStage, protocol
+from sensors_io.recording.journal import JournalError, JournalWriter
 from sensors_io.recording.session import SessionConfig, record_session
-from sensors_io.records import RecordStore
-from sensors_io.schema import Flag
+from sensors_io.records import RecordsExistError, RecordStore
+from sensors_io.schema import Flag, SchemaError
 from tests.sensors_io.checks import refused
 from tests.sensors_io.recording.hand import MS, Camera, Hand, Scale, Skin
 
@@ -180,3 +184,65 @@ def test_a_force_sensor_out_of_its_range_is_an_alarm_and_a_flag(tmp_path):
     assert np.all(-press.force_n[flagged, 2] > 14)
     assert not np.any(slide.flags)
     assert any("out of its range" in status.alarm for status in hand.statuses)
+
+
+def test_a_stopped_session_goes_on_behind_what_is_done(tmp_path):
+    hand = Hand()
+    assert session(tmp_path, hand, stop=lambda: hand.contacts >= 4).contacts == 4
+    assert session(tmp_path, Hand()).contacts == 15
+    assert len(RecordStore(tmp_path)) == 19
+
+
+def test_a_device_that_fails_for_good_leaves_its_contact_in_the_records(tmp_path):
+    class Failing(Camera):
+        def drain(self):
+            if self.count > 40:
+                raise DeviceLostError("unplugged")
+            return super().drain()
+
+    hand = Hand()
+    with pytest.raises(DeviceLostError):
+        record_session(tmp_path, SHORT, [Failing(hand)], Scale(hand), show=hand.show)
+    assert not list((tmp_path / ".journals").iterdir())
+    report = session(tmp_path, Hand(), SHORT)
+    assert (report.contacts, report.recovered, report.incomplete) == (2, 0, 0)
+    store = RecordStore(tmp_path)
+    assert len(store.contact(0)["gelsight_mini"]) > 20
+    assert not store.contact(0)["gelsight_mini"].camera["recording"]["end"]["complete"]
+    assert [(k.motion, k.trial) for k in store.contacts] == [("press", 0), ("press", 1), ("slide_x", 0)]
+
+
+def test_a_gap_of_the_camera_is_flagged(tmp_path):
+    class Gappy(Camera):
+        def drain(self):
+            if self.count == 40:
+                self.count += 1
+            return super().drain()
+
+    hand = Hand()
+    record_session(tmp_path, dataclasses.replace(CONFIG, free_s=0.6), [Gappy(hand)], Scale(hand), show=hand.show)
+    flags = RecordStore(tmp_path).contact(0)["gelsight_mini"].flags
+    assert np.flatnonzero(flags & np.uint32(Flag.TIME_GAP)).tolist() == [40]
+
+
+def test_a_skin_leads_the_protocol_where_there_is_no_force_sensor(tmp_path):
+    hand = Hand()
+    report = record_session(tmp_path, SHORT, [Camera(hand), Skin(hand)], None, show=hand.show)
+    made = RecordStore(tmp_path).contact(0)
+    assert (report.contacts, report.incomplete) == (2, 0)
+    assert made["gelsight_mini"].force_n is None
+    assert -made["tac3d"].force_n[:, 2].min() == pytest.approx(20, abs=1.1)
+
+
+def test_sensors_of_one_name_and_records_of_other_sensors_are_refused(tmp_path):
+    hand = Hand()
+    with pytest.raises(SchemaError, match="name two of one kind apart"):
+        record_session(tmp_path, SHORT, [Camera(hand), Camera(hand)], Scale(hand), show=hand.show)
+    session(tmp_path, hand, SHORT)
+    refused(RecordsExistError, r"recorded-2 gelsight_mini', not 'recorded-2 gelsight_mini\+tac3d'", both, tmp_path)
+
+
+def test_a_journal_of_an_earlier_version_is_refused(tmp_path):
+    with JournalWriter(tmp_path / "old.journal") as writer:
+        writer.append("start", {"key": {}, "identity": {}})
+    refused(JournalError, "earlier version", assemble, tmp_path / "old.journal")

@@ -86,3 +86,11 @@ def test_impossible_input_is_refused() -> None:
     hertz, depth, area = _sphere_ramp(np.linspace(0.005, 0.5, 50))
     refused(ValueError, "must stiffen", lambda: adhesive_ramp(np.sqrt(hertz), depth, area, 5e-5))
     refused(ValueError, "must not shrink", adhesive_ramp, hertz, depth, area[::-1], 5e-5)
+
+
+def test_adhesion_changes_a_light_touch_most() -> None:
+    change = [widening(SOFT, force) for force in (0.02, 0.2, 2.0, 20.0)]
+    assert change == sorted(change, reverse=True)
+    assert change[2] < 0.05 < change[0]
+    none = dataclasses.replace(SOFT, work_n_per_mm=0.0)
+    assert (widening(none, 0.02), none.least_force_n(0.1)) == (0, 0)

@@ -5,11 +5,13 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from sensors_io.layer import Layer
 from sensors_io.scenes import drag, traction
 from sensors_io.scenes.hertz import Hertz
 from sensors_io.scenes.mindlin import half_space
+from sensors_io.scenes.motions import plan
 
 N, M, WINDOW_MM = 40, 80, 16.0
 SPACING = WINDOW_MM / N
@@ -106,3 +108,38 @@ def test_what_lets_go_forgets() -> None:
     np.testing.assert_array_equal(made.traction_mpa[2], 0)
     np.testing.assert_allclose(made.force_n[3, 0], 0, atol=1e-4)
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(made))
+
+
+def test_pressing_harder_keeps_the_pull() -> None:
+    """What sticks carries on: the tangential force stays while the contact grows at rest."""
+    pressures = [_pressure(f) for f in (2.0, 2.0, 3.0, 4.0)]
+    slide = np.array([[0.0, 0.0], [0.1, 0.0], [0.1, 0.0], [0.1, 0.0]])
+    made = _frames(pressures, slide, _half_space())
+    np.testing.assert_allclose(made.force_n[2:, 0], made.force_n[1, 0], rtol=0.05)
+
+
+def test_x_and_y_are_alike() -> None:
+    slide = np.stack([np.linspace(0, 0.4, 4), np.zeros(4)], 1)
+    along_x = _frames([_pressure(2.0)] * 4, slide, _layer())
+    along_y = _frames([_pressure(2.0)] * 4, slide[:, ::-1], _layer())
+    x, y, z = np.moveaxis(along_x.displacement_mm, 1, 0)
+    by_swap = np.stack([y, x, z], 1).transpose(0, 1, 3, 2)
+    np.testing.assert_allclose(along_y.displacement_mm, by_swap, atol=2e-3 * np.abs(x).max())
+
+
+def test_a_twist_turns_the_gel_and_slips_at_its_torque() -> None:
+    made = _frames([_pressure(2.0)] * 8, np.zeros((8, 2)), _half_space(), np.linspace(0, 6, 8))
+    a = Hertz(radius_mm=8.0, plane_modulus_mpa=2 * SHEAR_MODULUS, force_n=2.0).contact_radius_mm
+    assert made.moment_nmm[-1, 2] == pytest.approx(3 * np.pi / 16 * FRICTION * 2.0 * a, rel=0.03)
+    assert np.all(np.diff(made.moment_nmm[:, 2]) > -1e-3)
+    np.testing.assert_allclose(made.force_n[:, :2], 0, atol=1e-3)
+
+
+def test_a_planned_slide_runs_through() -> None:
+    made_plan = plan("slide_x", 2.0)
+    poses = zip(made_plan.force_n, made_plan.slide_mm[:, 0], strict=True)
+    pressures = [_pressure(f, x) if f > 0 else np.zeros((N, N)) for f, x in poses]
+    made = _frames(pressures, made_plan.slide_mm, _layer())
+    assert made.converged.all()
+    assert np.abs(made.force_n[:, 0]).max() == pytest.approx(FRICTION * 2.0, rel=0.01)
+    np.testing.assert_array_equal(made.traction_mpa[made_plan.force_n == 0], 0)

@@ -178,3 +178,31 @@ def test_a_graded_object_changes_geometrically_and_steadily() -> None:
 def test_shares_that_are_none_are_refused(shares: tuple[float, float]) -> None:
     with pytest.raises(ValueError, match="part_share, graded_share are"):
         objects.sample(np.random.default_rng(0), 0.3, 0.8, *shares)
+
+
+def test_what_came_later_leaves_the_rest_as_it_was() -> None:
+    """The same object, whatever the shares of objects that vary, and the same generator afterwards."""
+    rngs = [np.random.default_rng(4) for _ in range(2)]
+    plain, varied = objects.sample(rngs[0], 0.3, 0.8), objects.sample(rngs[1], 0.3, 0.8, part_share=1.0)
+    for field in dataclasses.fields(objects.Solid):
+        if field.name != "variation":
+            np.testing.assert_array_equal(getattr(plain, field.name), getattr(varied, field.name))
+    assert plain.variation is None
+    assert varied.variation is not None
+    assert rngs[0].random() == rngs[1].random()
+
+
+def test_the_skin_over_a_seam_is_that_of_each_side() -> None:
+    solid = objects.sample(np.random.default_rng(9), 0.0, 0.8, part_share=1.0)
+    v = solid.variation
+    assert v is not None
+    direction = np.array([np.cos(v.direction_rad), np.sin(v.direction_rad)])
+    site = direction * v.offset_mm
+    x = (jnp.arange(96) + 0.5) * 0.25 - 12.0
+    parts = (solid, solid.at(-99 * direction), solid.at(99 * direction))
+    both, near, far = (np.asarray(surface.gap(surface.make_skin(s, site, 0.0), _pose(), x)) for s in parts)
+    x_n = np.asarray(x)
+    along = x_n[None] * np.cos(v.direction_rad) + x_n[:, None] * np.sin(v.direction_rad)
+    for side, alone in ((along < -2, near), (along > 2, far)):
+        difference = (both - alone)[side]
+        np.testing.assert_allclose(difference, difference.mean(), atol=1e-3)

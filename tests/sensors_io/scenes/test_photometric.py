@@ -71,3 +71,13 @@ def test_grain_has_its_deviation_and_its_correlations() -> None:
     np.testing.assert_allclose(grain.std((1, 2)), (0.01, 0.02, 0.005), rtol=0.05)
     assert np.corrcoef(grain[0].ravel(), grain[1].ravel())[0, 1] == pytest.approx(0.6, abs=0.05)
     assert np.corrcoef(grain[0, 1:].ravel(), grain[0, :-1].ravel())[0, 1] == pytest.approx(0.5, abs=0.05)
+
+
+def test_flat_gel_has_the_background_of_the_real_one() -> None:
+    """Read off the recording by eye: pink in the middle, blue-green above, dull green below."""
+    image = 255 * np.asarray(photometric.gelsight_mini(_gel(ZERO), _light()))
+    middle, top, bottom = image[PX // 2, PX // 2], image[3, PX // 2], image[-4, PX // 2]
+    assert middle[0] > 1.4 * max(top[0], bottom[0])
+    assert top[2] > 1.2 * bottom[2]
+    assert top[1] > top[0]
+    assert np.all((image > 20) & (image < 180))

@@ -10,9 +10,10 @@ from sensors_io.scenes import press as press_module
 from sensors_io.scenes import readout
 from sensors_io.scenes.cards import object_cards
 from sensors_io.scenes.config import SceneConfig, config_hash
+from sensors_io.scenes.draws import site_of
 from sensors_io.scenes.protocol import contacts, make_contact
 from sensors_io.scenes.sensors import MODELS
-from sensors_io.schema import SENSORS, Flag, Sequence
+from sensors_io.schema import SENSORS, UNKNOWN, Flag, Sequence
 from tests.sensors_io.checks import refused
 
 SMALL = SceneConfig(objects=60, sites=2, frames=3, image_px=48, contact_grid=40, view_px=32, min_force_n=1.0)
@@ -159,3 +160,36 @@ def test_padding_is_two_thicknesses_and_smooth() -> None:
         assert (size - 64) * model.window_mm / 64 >= 2 * model.gel.thickness_mm
         assert size <= 110
         assert 30**7 % size == 0
+
+
+def _leave_one_out(features: np.ndarray, labels: np.ndarray) -> float:
+    """Accuracy of linear discriminants with pooled covariance, each object judged by all others."""
+    hits = 0
+    for i in range(len(labels)):
+        rest = np.arange(len(labels)) != i
+        x, y = features[rest], labels[rest]
+        means = np.array([x[y == k].mean(0) for k in range(3)])
+        within = np.cov((x - means[y]).T) + 1e-4 * np.eye(x.shape[1])
+        apart = features[i] - means
+        hits += int(np.argmin(np.einsum("kd,de,ke->k", apart, np.linalg.inv(within), apart)) == labels[i])
+    return hits / len(labels)
+
+
+def test_touch_tells_hardness_and_force_alone_does_not(some: list[list[Sequence]]) -> None:
+    labels = np.array([c.labels["hardness"] for c in object_cards(SMALL)])
+    force = np.array([c[2].force_n[:, 2] for c in some])
+    depth = np.array([np.maximum(c[2].depth_mm, 1e-3) for c in some])
+    touch = np.concatenate([np.log(depth.max((2, 3))), np.log(depth.mean((2, 3)))], 1)
+    assert _leave_one_out(touch, labels) > 0.58
+    assert _leave_one_out(force, labels) < 0.46
+
+
+def test_objects_may_vary_and_their_sites_do_not() -> None:
+    varied = dataclasses.replace(SMALL, objects=40, part_share=0.5, graded_share=0.5)
+    cards = object_cards(varied)
+    assert all("far_modulus_mpa" in (card.truth or {}) for card in cards)
+    assert any(UNKNOWN in card.labels.values() for card in cards)
+    site = site_of(varied, 0, 0, 0)
+    assert site.solid.variation is None
+    with pytest.raises(ValueError, match=r"graded_share is 0\.6: must be ≤ 1 − part_share = 0\.5"):
+        dataclasses.replace(varied, graded_share=0.6)

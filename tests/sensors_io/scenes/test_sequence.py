@@ -10,7 +10,7 @@ from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.draws import site_of
 from sensors_io.scenes.protocol import make_contact
 from sensors_io.scenes.sensors import MODELS
-from sensors_io.scenes.sequence import make_sequence
+from sensors_io.scenes.sequence import light_touches, make_sequence
 from sensors_io.schema import SENSORS, Flag, Phase
 
 CONFIG = SceneConfig(objects=12, sequences=4 * 40, frames=40, image_px=24, contact_grid=24, view_px=16)
@@ -105,3 +105,27 @@ def test_limits_lie_where_the_strain_does():
             slot = schedule.Slot(object_index=i, site=0, motion="hold", force_n=float(factor * limits.actual_n[i]))
             flags = make_sequence(CONFIG, 20 + i, slot, TAC3D, 0).flags
             assert bool(np.any(flags & np.uint32(Flag.STRAIN_LIMIT))) == past, (i, factor)
+
+
+def test_adhesion_counts_in_the_lightest_touches_of_smooth_objects():
+    config = dataclasses.replace(CONFIG, objects=40)
+    force = np.array([0.0, 0.01, 0.1, 0.3, 1.0, 5.0])
+    found = []
+    for index in range(config.objects):
+        site = site_of(config, index, 0, 0)
+        found.append(light_touches(config, MODELS[TAC3D], site, force) > 0)
+        if site.solid.rms_mm > 0.03:
+            assert not found[-1].any()
+    share = np.mean(found, 0)
+    assert share[0] == share[-1] == 0
+    assert np.all(np.diff(share[1:]) <= 0)
+    assert 0.1 < share[1] < 0.7
+
+
+def test_a_coupled_press_feels_the_spreading_gel_and_an_uncoupled_one_nothing(hold):
+    coupled = make_sequence(dataclasses.replace(CONFIG, coupled=True), 6, _slot("hold", 8.0), TAC3D, 0)
+    np.testing.assert_array_equal(coupled.depth_mm.shape, hold.depth_mm.shape)
+    pressed = hold.target_force_n > 4
+    change = np.abs(coupled.shear_mm - hold.shear_mm)[pressed].max()
+    assert 0.002 < change < 0.5  # above the rounding, below what would be a slide
+    assert np.abs(coupled.force_n[:, :2] - hold.force_n[:, :2]).max() < 0.3  # what spreads evenly pulls nowhere

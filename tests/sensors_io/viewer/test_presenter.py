@@ -1,13 +1,14 @@
 """What a bench shows, from fake devices."""
 
 import json
+import threading
 import time
 
 import numpy as np
 import pytest
 
 from sensors_io.devices.base import Identity, Sample
-from sensors_io.devices.errors import StaleFrameError
+from sensors_io.devices.errors import StaleFrameError, StreamEndedError
 from sensors_io.devices.intake import Counts
 from sensors_io.schema import Flag
 from sensors_io.viewer.presenter import Channel, Presenter
@@ -71,3 +72,32 @@ def test_alarms_are_told_worst_first(live):
     assert "too slowly" in shown(presenter, live)["alarm"]
     skin.newest = StaleFrameError("old")
     assert not presenter.step()
+
+
+def test_a_session_puts_its_prompt_on_the_page(live):
+    said = shown(Presenter([Channel(Watched("tac3d"))], None, live, lambda: ("hold 5 N", "out of range")), live)
+    assert (said["prompt"], said["alarm"]) == ("hold 5 N", "out of range")
+
+
+def test_the_background_of_a_camera_is_refreshed_where_nothing_touches(live):
+    gel = np.random.default_rng(0).integers(60, 120, (40, 40, 3)).astype(np.uint8)
+    camera = Watched("gelsight_mini", frame=gel)
+    channel = Channel(camera)
+    for level in range(130):
+        camera.newest = camera.made({}, gel + np.uint8(level // 26))
+        channel.look()
+    assert channel.drift.rms == pytest.approx(0.66, abs=0.1)
+    assert "grey levels" in channel.table()["background drift"]
+
+
+def test_it_runs_beside_and_stops_with_its_device(live):
+    device = Watched("tac3d", {"depth_mm": np.zeros((4, 4))})
+    presenter = Presenter([Channel(device)], None, live)
+    with presenter.beside():
+        deadline = time.monotonic() + 5
+        while live.shown.version == 0 and time.monotonic() < deadline:
+            time.sleep(0.01)
+    assert live.shown.version == 1
+    device.newest = StreamEndedError("over")
+    presenter.run(lambda: False)
+    assert not [t for t in threading.enumerate() if t.name == "presenter"]

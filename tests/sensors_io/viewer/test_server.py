@@ -5,6 +5,7 @@ import http.client
 import json
 import socket
 import struct
+import threading
 import urllib.error
 import urllib.parse
 import urllib.request
@@ -151,3 +152,27 @@ def test_numbers_that_json_does_not_know_are_null():
         view.publish({}, dataclasses.replace(NUMBERS, force_n=(0.0, float("nan"), float("inf"))))
         with ask(view, "numbers") as events:
             assert json.loads(events.readline().removeprefix(b"data: "))["force_n"] == [0.0, None, None]
+
+
+def test_streams_end_with_the_view_and_a_taken_port_is_an_error():
+    with LiveView(port=0) as view:
+        port = int(urllib.parse.urlsplit(view.address).port)
+        with pytest.raises(OSError, match="in use"), LiveView(port=port):
+            pass
+        view.publish({}, NUMBERS)
+        events = ask(view, "numbers")
+        events.readline()
+    assert events.read() == b"\n"
+    events.close()
+
+
+def test_connections_too_many_are_closed():
+    with LiveView(port=0) as view:
+        port = int(urllib.parse.urlsplit(view.address).port)
+        before = threading.active_count()
+        silent = [socket.create_connection(("127.0.0.1", port), timeout=10) for _ in range(100)]
+        for connection in silent[64:]:
+            assert connection.recv(1) == b""
+        assert threading.active_count() - before <= 64
+        for connection in silent:
+            connection.close()
