@@ -11,7 +11,7 @@ from typing import Any
 import tyro
 
 from sensors_io.commands.console import ERR, OUT, complain, print_in_any_encoding
-from sensors_io.commands.numbers import require_possible
+from sensors_io.commands.values import require_possible
 from sensors_io.errors import UserError
 
 PROG = "python -m sensors_io"
