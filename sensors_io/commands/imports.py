@@ -13,6 +13,7 @@ from sensors_io.commands.console import OUT, progress_bar
 from sensors_io.importers.catalogue import Catalogue, import_catalogue
 from sensors_io.importers.estimate_modulus import list_estimate_modulus
 from sensors_io.importers.feelanyforce import FeelAnyForceConfig, list_feelanyforce
+from sensors_io.importers.gel import NO_GEL, SourceGel
 from sensors_io.importers.hdf5 import HDF5Config, hdf5_files, list_hdf5
 from sensors_io.importers.hdf5_inspect import UNKNOWN_UNIT, describe, propose
 from sensors_io.importers.hdf5_read import HDF5Error
@@ -37,6 +38,14 @@ class _Paths:
     """Directory of the data set as it is published, or of your clips."""
     out: pathlib.Path
     """Directory of the records."""
+    mm_per_px: float | None = None
+    """Millimetres per pixel of the published pictures, for `check` and `extract`; kept at the size that is stored."""
+    background: pathlib.Path | None = None
+    """Picture of the gel at rest at the size of the published pictures, kept for `check` and `extract`."""
+
+    def gel(self) -> SourceGel:
+        """The gel of its sensor."""
+        return SourceGel(mm_per_px=self.mm_per_px, background=self.background)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -202,9 +211,10 @@ class Import:
     def run(self) -> int:
         if isinstance(self.dataset, Hdf5) and self.dataset.inspect:
             return self.dataset.show()
+        gel = self.dataset.gel() if isinstance(self.dataset, _Paths) else NO_GEL
         catalogue = self.dataset.catalogue()
         with progress_bar("contacts") as progress:
-            report = import_catalogue(catalogue, self.dataset.out, progress=progress)
+            report = import_catalogue(catalogue, self.dataset.out, gel=gel, progress=progress)
         OUT.print(overview.import_table(report))
         if any(report.objects[split] for split in SPLITS if split != "unlabelled"):
             train = (
