@@ -23,6 +23,7 @@ COMMANDS: Mapping[str, str] = {
     "list": "list.List",
     "reindex": "reindex.Reindex",
     "push": "push.Push",
+    "export": "export.Export",
     "label": "label.Label",
     "devices": "devices.Devices",
     "view": "view.View",
@@ -34,6 +35,7 @@ COMMANDS: Mapping[str, str] = {
     "zero": "zero.Zero",
     "force-zero": "force_zero.ForceZeroing",
     "sync": "sync.Sync",
+    "ros2": "ros2.Ros2",
 }
 """Module and class of each, in `sensors_io.commands`.
 
