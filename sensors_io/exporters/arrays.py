@@ -3,6 +3,7 @@
     /                             attribute `touchr1`: JSON with source, licence, sensors and notes
     /objects/<number>             attribute `plain`: JSON with object_id, labels, …;   view, view_depth_mm
     /contacts/<number>/<sensor>   attribute `plain`: JSON with key, serial, camera, …;   the arrays of FRAME_ARRAYS
+    /backgrounds/<file>           bytes of the PNG files with the gel at rest
 
 Both libraries compress without loss; arrays have the types and units of `schema.FRAME_ARRAYS`.
 """
@@ -13,6 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from sensors_io.contents import RESTS, rest_pictures
 from sensors_io.errors import MALFORMED, UserError
 from sensors_io.exporters.selection import (
     ExportError,
@@ -49,6 +51,8 @@ def export_arrays(selected: Selected, out: pathlib.Path, kind: Kind, progress: P
                 group = root.create_group(f"objects/{number:06d}")
                 group.attrs[_PLAIN] = card_text(card)
                 _put_all(group, put, {name: getattr(card, name) for name in _VIEWS})
+            rests = root.create_group(RESTS)
+            _put_all(rests, put, {n: np.frombuffer(x, np.uint8) for n, x in rest_pictures(selected.store.path).items()})
             for number, contact in selected.contacts(progress):
                 for sensor, sequence in contact.items():
                     group = root.create_group(f"contacts/{number:06d}/{sensor}")
@@ -76,7 +80,8 @@ def import_arrays(path: pathlib.Path, out: pathlib.Path, progress: Progress) -> 
             progress(done, len(numbers))
 
         contacts = (_contact(root["contacts"][number], meta.sensors) for number in numbers)
-        write_back(meta, _cards(root), contacts, out, one_more)
+        rests = {name: root[RESTS][name][...].tobytes() for name in root[RESTS]}
+        write_back(meta, _cards(root), contacts, rests, out, one_more)
     except UserError:
         raise
     except MALFORMED as error:

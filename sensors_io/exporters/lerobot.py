@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from sensors_io.codec import decode_card, encode_card
+from sensors_io.contents import put_rest_pictures, rest_pictures
 from sensors_io.errors import MALFORMED, UserError
 from sensors_io.exporters.lerobot_files import EpisodeFiles, EpisodeReader, feature, write_table
 from sensors_io.exporters.selection import (
@@ -75,6 +76,7 @@ def export_lerobot(selected: Selected, out: pathlib.Path, fps: int, progress: Pr
         write_table(temporary / OURS / "sequences.parquet", rows)
         cards = [{"object_id": card.object_id, "card": encode_card(card)} for card in selected.cards()]
         write_table(temporary / OURS / "objects.parquet", cards)
+        put_rest_pictures(temporary / OURS, rest_pictures(selected.store.path))
         (temporary / OURS / "records.json").write_text(meta_text(selected.meta))
 
 
@@ -103,7 +105,7 @@ def import_lerobot(path: pathlib.Path, out: pathlib.Path, progress: Progress) ->
             [_sequence(sensor, text, columns) for sensor, text in plain[episode]]
             for episode, columns in enumerate(reading.episodes())
         )
-        write_back(meta, cards, contacts, out, one_more)
+        write_back(meta, cards, contacts, rest_pictures(path / OURS), out, one_more)
     except UserError:
         raise
     except (OSError, *MALFORMED) as error:

@@ -11,6 +11,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
+from sensors_io.contents import put_rest_pictures
 from sensors_io.errors import UserError
 from sensors_io.index import RecordsMeta
 from sensors_io.records import RecordStore, RecordWriter
@@ -135,11 +136,13 @@ def write_back(
     meta: RecordsMeta,
     cards: Iterable[ObjectCard],
     contacts: Iterable[list[Sequence]],
+    rests: Mapping[str, bytes],
     out: pathlib.Path,
     progress: Callable[[], object],
 ) -> None:
     """Write what an export holds as records; an interrupted import goes on behind the contacts that are there."""
     with RecordWriter(out, meta=meta, resume=True) as writer:
+        put_rest_pictures(out, rests)
         for card in cards:
             if card.object_id not in writer.objects_done:
                 writer.write_object(card)

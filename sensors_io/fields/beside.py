@@ -7,6 +7,7 @@ import json
 import pathlib
 from collections.abc import Callable, Iterator
 
+from sensors_io.contents import put_rest_pictures, rest_pictures
 from sensors_io.fields.extract import ExtractConfig
 from sensors_io.fields.recorded import RecordedGels, RestGel, with_fields
 from sensors_io.fields.types import Calibration, CalibrationError
@@ -104,6 +105,7 @@ def fields_beside(
             units.append(WorkUnit(name=name, run=run, done=part_path(out.absolute(), name).exists))
         return units
 
+    put_rest_pictures(out, rest_pictures(store.path))
     cards = store.objects.values()
     write_by_units(out, meta, cards, units_from, launcher, lambda done: progress(done, len(store)))
 

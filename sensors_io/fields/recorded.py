@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from sensors_io.fields.extract import ExtractConfig, Extractor, joined
-from sensors_io.fields.sources import read_picture
+from sensors_io.fields.sources import SourceError, read_picture
 from sensors_io.fields.types import Calibration, CalibrationError, Fields
 from sensors_io.importers.keep import at_height
 from sensors_io.quality import QualityConfig, time_gap
@@ -62,7 +62,7 @@ class RecordedGels:
             return "they hold no pictures"
         try:
             self.extractor(sequence)
-        except (SchemaError, CalibrationError) as error:
+        except (SchemaError, CalibrationError, SourceError) as error:
             return str(error)
         return ""
 
@@ -71,7 +71,7 @@ class RecordedGels:
 
         Raises:
           CalibrationError: no gel at rest, or none of this shape; no pitch; a calibration of another window.
-          SchemaError: a gel at rest that cannot be one.
+          SchemaError, SourceError: a gel at rest that cannot be one, or cannot be read.
         """
         assert sequence.frames is not None
         shape = sequence.frames.shape[1:]
@@ -79,7 +79,8 @@ class RecordedGels:
         if calibration is not None and calibration.background.shape != shape:
             calibration = calibration.at_size((shape[0], shape[1]))
         pitch = self._pitch(sequence, calibration)
-        name, own = background_file(sequence), not background_file(sequence) and self._gel.rest_frames > 0
+        name = background_file(sequence)
+        own = not name and self._gel.rest_frames > 0
         known = None if own else self._extractors.get((name, pitch, shape))
         if known is not None:
             return known

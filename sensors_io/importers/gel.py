@@ -7,11 +7,12 @@ import pathlib
 import cv2
 import numpy as np
 
+from sensors_io.contents import RESTS, put_rest_pictures
 from sensors_io.importers.keep import ImportSourceError, UnreadableError
 from sensors_io.importers.pictures import read_picture
 from sensors_io.schema import Sequence
 
-_FOLDER = "backgrounds"
+_REST = "rest.png"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -63,12 +64,8 @@ class SourceGel:
         """
         if self.background is None:
             return
-        path = out / _FOLDER / "rest.png"
-        path.parent.mkdir(exist_ok=True)
-        temporary = path.with_suffix(".tmp.png")
-        if not cv2.imwrite(str(temporary), cv2.cvtColor(self._picture(), cv2.COLOR_RGB2BGR)):
-            raise OSError(f"{temporary} cannot be written: the folder must be writable; choose another --out")
-        temporary.replace(path)
+        _, data = cv2.imencode(".png", cv2.cvtColor(self._picture(), cv2.COLOR_RGB2BGR))
+        put_rest_pictures(out, {_REST: data.tobytes()})
 
     def kept(self, sequence: Sequence) -> Sequence:
         """The sequence with its gel; the pitch is that of its pictures as they were brought to their height."""
@@ -78,7 +75,7 @@ class SourceGel:
         if self.mm_per_px is not None:
             pitch = self.mm_per_px * camera.get("size_px", sequence.frames.shape[1:3])[0] / sequence.frames.shape[1]
         if self.background is not None:
-            camera["recording"] = {"background": f"{_FOLDER}/rest.png"}
+            camera["recording"] = {"background": f"{RESTS}/{_REST}"}
         return dataclasses.replace(sequence, camera=camera, mm_per_px=pitch)
 
     def _picture(self) -> np.ndarray:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sensors_io.codec import encode_card, encode_sequence
+from sensors_io.contents import put_rest_pictures, rest_pictures
 from sensors_io.exporters import selection
 from sensors_io.exporters.arrays import export_arrays
 from sensors_io.exporters.exported import import_exported
@@ -31,6 +32,7 @@ def export(kind: str, records: pathlib.Path, out: pathlib.Path, **changes) -> No
 
 
 def equal(a: RecordStore, b: RecordStore) -> None:
+    assert rest_pictures(a.path) == rest_pictures(b.path)
     assert (a.contacts, a.meta) == (b.contacts, b.meta)
     assert [encode_card(card) for card in a.objects.values()] == [encode_card(card) for card in b.objects.values()]
     for i in range(len(a)):
@@ -59,6 +61,7 @@ def rich(path: pathlib.Path) -> pathlib.Path:
                     "calibration": "c0ffee",
                 }
                 writer.write_contact([fakes.sequence(n, s, trial=trial, **more) for s in ("gelsight_mini", "tac3d")])
+    put_rest_pictures(path, {"rest.png": b"a picture"})
     return path
 
 

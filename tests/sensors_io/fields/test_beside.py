@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sensors_io.codec import encode_sequence
+from sensors_io.contents import put_rest_pictures, rest_pictures
 from sensors_io.errors import UserError
 from sensors_io.fields import beside
 from sensors_io.fields.beside import FieldsJob, fields_beside
@@ -54,9 +55,11 @@ def job(records: pathlib.Path, **changes) -> FieldsJob:
 
 def test_fields_lie_beside_the_pictures(tmp_path):
     records, out = written(tmp_path / "records"), tmp_path / "fields"
+    put_rest_pictures(records, {"rest.png": b"a picture"})
     fields_beside(job(records, rows=SHAPE[0] // 2), out)
     before, after = RecordStore(records), RecordStore(out)
     assert after.contacts == before.contacts
+    assert rest_pictures(out) == {"rest.png": b"a picture"}
     assert after.objects["object_0"].labels == before.objects["object_0"].labels
     old, new = before.contact(1), after.contact(1)
     assert encode_sequence(old["xense"]) == encode_sequence(new["xense"])
@@ -140,5 +143,7 @@ def test_a_calibration_serves_pictures_of_another_size(tmp_path):
     assert np.abs(found.depth_mm[1] - area).max() < 0.02 * area.max()
     assert "must be equal" in gels.problem(recorded(frames=small, mm_per_px=0.1))
     assert "same window" in gels.problem(recorded(frames=small[:, :-10]))
+    lost = {"recording": {"background": "gone.png"}}
+    assert "gone.png is absent" in gels.problem(recorded(camera=lost))
     assert "--mm-per-px" in RecordedGels(tmp_path, RestGel(rest_frames=1)).problem(recorded(mm_per_px=None))
     assert RecordedGels(tmp_path, RestGel(rest_frames=1, mm_per_px=0.2)).problem(recorded(mm_per_px=None)) == ""
