@@ -141,7 +141,7 @@ def contact_row(store: RecordStore, which: str) -> int:
 def _of_contact(store: RecordStore | LiveScenes, i: int, saved: SavedPolicy, name: str) -> AskedTouch:
     """A contact with its object's card."""
     card = store.objects[store.contacts[i].object_id]
-    return _asked(store.contact(i, fields=False), card, saved, name)
+    return _asked(store.contact(i, fields=saved.reads.show == "fields"), card, saved, name)
 
 
 def _filmed(path: Path, saved: SavedPolicy, sensor: str) -> AskedTouch:

@@ -37,6 +37,7 @@ def publish_policy(policy: TouchPolicy, params: Params, data: Dataset, name: str
     reads = PolicyInput(
         rejected=tuple(str(flag.name) for flag in data.clip.rejected),
         choose=data.clip.choose,
+        show=data.clip.show,
         force=data.has_force,
         view=any(card.view is not None for card in data.store.objects.values()),
     )
@@ -140,4 +141,5 @@ def clip_of(saved: SavedPolicy) -> ClipConfig:
         sensors=saved.sensors,
         rejected=tuple(Flag[name] for name in saved.reads.rejected),
         choose=saved.reads.choose,  # type: ignore[arg-type]
+        show=saved.reads.show,  # type: ignore[arg-type]
     )

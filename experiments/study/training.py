@@ -12,6 +12,7 @@ from experiments.study.stages import StudySFT
 from sensors_io.pipeline import ClipConfig
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import ATTRIBUTES, Flag
+from sensors_io.selection import Shown
 from touchr1_jax.bench.metrics import ORDINAL
 from touchr1_jax.distributed.processes import GIB
 from touchr1_jax.models.lora import LoraConfig
@@ -70,6 +71,8 @@ class TrainingConfig(SourceConfig):
     """Threads that read clips ahead; on two cores a second one would only take time from the step."""
     noise_contacts: int = 64
     """Contacts whose pixels and forces give noise its statistics; they are in memory at once."""
+    show: Shown = "pictures"
+    """`fields` shows the policy depth and deformation as images in the place of pictures, where records have both."""
     model: TouchConfig = TouchConfig()
     encoder: Path | None = None
     """Run of `pretrain_encoder`, or its `encoder.npz`, that SFT starts from; its shape replaces `model.tactile`."""
@@ -155,6 +158,7 @@ def open_data(config: TrainingConfig, view_px: int, context: Context) -> Dataset
         image_px=config.model.image_px,
         view_px=view_px,
         rejected=(Flag.NOT_CONVERGED, Flag.SATURATED),
+        show=config.show,
     )
     context.print(require_memory({"clips at most": round(config.clip_memory_gib * GIB)}))
     path = prepare_records(config, context)

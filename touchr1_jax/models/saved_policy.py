@@ -56,11 +56,13 @@ class PolicyInput:
     Attributes:
       rejected: names of the quality flags whose frames are left out.
       choose: rule by which the frames of a sequence are chosen (`sensors_io.selection.choose_frames`).
+      show: camera pictures, or the fields beside them, as images (`sensors_io.selection.field_images`).
       force, view: whether a force was measured, and whether objects had a picture.
     """
 
     rejected: tuple[str, ...] = ()
     choose: str = "auto"
+    show: str = "pictures"
     force: bool = True
     view: bool = True
 
@@ -132,7 +134,8 @@ def read_policy(folder: Path) -> SavedPolicy:
                 raise PolicyError(f"policy is {folder}: {name} is missing or damaged; copy the folder again")
         notes = {**config["notes"]}
         model, language = _rebuilt(ModelConfig, config["model"]), _rebuilt(Language, config["language"])
-        reads, questions = _rebuilt(PolicyInput, config["input"]), dict(config["questions"])
+        known = {"show": PolicyInput.show, **config["input"]}  # those saved before it could be chosen see pictures
+        reads, questions = _rebuilt(PolicyInput, known), dict(config["questions"])
         vocabulary = json.loads((folder / TOKENIZER_FILE).read_text(encoding="utf-8"))["model"]["vocab"]
         words = sorted(vocabulary, key=vocabulary.__getitem__)[len(word_library(()).get_vocab()) :]
         policy = assemble_policy(model, language, word_tokenizer(words), questions)
