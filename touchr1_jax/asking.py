@@ -21,6 +21,7 @@ import cv2
 import jax
 import numpy as np
 
+from touchr1_jax.models.lora import of_decoder
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.saved_policy import PolicyError, Precision, SavedPolicy, read_policy, save_policy, words
 from touchr1_jax.rl.rollout import GRPOBatch
@@ -196,7 +197,7 @@ class AskablePolicy:
         felt = np.arange(len(contact))[:, None] < n * a
         streams = np.asarray(features.stream_mask)[contact] & felt
         batch = question_batch(policy, features, unknown, contact, attribute, streams)
-        tokens, level, share = self._decoded({"decoder": params["decoder"]}, batch)
+        tokens, level, share = self._decoded(of_decoder(params), batch)
 
         def answer(row: int, untouched: TouchAnswer | None = None) -> TouchAnswer:
             name, asked = list(self.attributes.items())[attribute[row]], int(level[row, attribute[row]])

@@ -11,6 +11,7 @@ from sensors_io.pipeline import ClipConfig
 from sensors_io.schema import Flag
 from touchr1_jax.asking import HUB, AskablePolicy, load_policy, shipped
 from touchr1_jax.bench.scoring import REPORTED
+from touchr1_jax.models.lora import exported
 from touchr1_jax.models.qwen.config import CONFIG_FILE
 from touchr1_jax.models.saved_policy import PolicyError, PolicyInput, SavedPolicy, save_policy
 from touchr1_jax.models.touch_policy import ModelConfig, TouchPolicy
@@ -46,7 +47,8 @@ def publish_policy(policy: TouchPolicy, params: Params, data: Dataset, name: str
         "records": data.store.digest,
         SCENES: meta.notes.get("config", {}),
     } | ({"limits": ONLY_SCENES} if meta.source == "generated" else {})
-    saved = SavedPolicy(policy=policy, params=params, reads=reads, notes=jsonable(notes))
+    whole = exported(params, policy.fns.lora)
+    saved = SavedPolicy(policy=policy, params=whole, reads=reads, notes=jsonable(notes))
     folder = context.directory / POLICIES / name / str(seed)
     context.processes.write_once(lambda: save_policy(folder, saved))
 

@@ -49,7 +49,7 @@ from sensors_io.schema import ATTRIBUTES, SENSORS, UNKNOWN
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.pretrained import load_encoder
 from touchr1_jax.models.tactile_vit import TactileViTConfig
-from touchr1_jax.models.touch_policy import ModelConfig, TouchPolicy, build_policy, check_model
+from touchr1_jax.models.touch_policy import ModelConfig, TouchPolicy, build_policy, check_model, with_lora
 from touchr1_jax.rewards import AnyReward, RewardError, make_rewards, uniform_prior
 from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
 from touchr1_jax.text.language import TOUCH_LANGUAGE
@@ -211,7 +211,7 @@ def run_study(
         load_encoder(config.encoder)  # a file that is no encoder is reported before data are made
     data = open_study_data(config, context)
     model, tactile = starting_model(config.model, config.encoder, data.clip.sensors)
-    policy = build_policy(model, data.clip.sensors)
+    policy = with_lora(build_policy(model, data.clip.sensors), config.lora)
     return train_study(config, data, policy, arms, context, algorithms, variants, tactile=tactile, share=config.share)
 
 
@@ -293,10 +293,10 @@ def train_study(
 def make_study_arm(
     config: TrainingConfig, policy: TouchPolicy, weights: Weights, prior: np.ndarray, algorithm: AnyAlgorithm
 ) -> GRPOArm:
-    """An arm with a study's steps, adapters and further rewards."""
+    """An arm with a study's steps and further rewards."""
     weights = {**weights, **config.more_rewards}
     grpo = dataclasses.replace(config.grpo, algorithm=config.algorithm(algorithm))
-    return make_arm(policy, weights, prior, grpo, config.grpo_loop, config.grpo_lora)
+    return make_arm(policy, weights, prior, grpo, config.grpo_loop)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

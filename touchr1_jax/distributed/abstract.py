@@ -12,12 +12,13 @@ import optax
 
 from touchr1_jax.distributed.memory import Compiled, GRPOShape, compiled_bytes
 from touchr1_jax.distributed.placement import gather_params, shard_step
-from touchr1_jax.models.lora import LoraConfig, LoraFns, Trainable, adapt, init_adapters
+from touchr1_jax.models.lora import LoraConfig, init_adapters
 from touchr1_jax.models.policy import Features, Slots
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.qwen.config import QwenConfig
 from touchr1_jax.models.qwen.model import abstract_params
 from touchr1_jax.models.qwen.policy import qwen_policy
+from touchr1_jax.models.stacked import ADAPTERS
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.rl.grpo import FrozenInputs, GRPOState, make_grpo_step, start_state
 from touchr1_jax.rl.rollout import GRPOBatch
@@ -101,8 +102,8 @@ def abstract_grpo(
     params: Params = decoder
     if lora is not None:
         base = jax.tree.map(lambda x: of(x.shape, jnp.bfloat16), decoder)
-        params = Trainable(adapters=jax.eval_shape(lambda k: init_adapters(k, decoder, lora), key), towers={})
-        fns = adapt(fns, base, lora)
+        params = {ADAPTERS: jax.eval_shape(lambda k: init_adapters(k, decoder, lora), key)}
+        fns = dataclasses.replace(fns, lora=lora)
     state = jax.eval_shape(lambda p, k: start_state(p, optimizer, k, shape.grpo), params, key)
     return AbstractStep(fns, state, batch, FrozenInputs(reference=params, noise=of((draws, s, n, d), kind)), base)
 
@@ -127,9 +128,7 @@ def compile_grpo(
     arguments: tuple[Any, ...] = (abstract.state, abstract.batch, abstract.frozen)
 
     def step(state: GRPOState, batch: GRPOBatch, frozen: FrozenInputs, base: Params | None = None):
-        fns = abstract.fns
-        if isinstance(fns, LoraFns):
-            fns = dataclasses.replace(fns, base=base)
+        fns = dataclasses.replace(abstract.fns, base=base or {})
         gather = functools.partial(gather_params, mesh)
         return make_grpo_step(fns, score, optimizer, shape.grpo, gather=gather)(state, batch, frozen)
 

@@ -27,6 +27,7 @@ from touchr1_jax.models.load import TOKENIZER_FILE, WeightsError
 from touchr1_jax.models.qwen.config import CONFIG_FILE
 from touchr1_jax.models.qwen.safetensors import read_header, read_tensor, write_file
 from touchr1_jax.models.qwen.weights import SINGLE
+from touchr1_jax.models.stacked import restacked, unstacked
 from touchr1_jax.models.touch_policy import ModelConfig, TouchPolicy, assemble_policy, touch_shapes
 from touchr1_jax.text.language import Language
 from touchr1_jax.text.template import QUESTIONS
@@ -251,7 +252,8 @@ def _format(folder: Path) -> str | None:
 
 def _stored(params: Params, precision: Precision) -> dict[str, np.ndarray]:
     """Tensors as they are written, by dotted names."""
-    flat = {name: np.asarray(x, np.float32) for name, x in traverse_util.flatten_dict(params, sep=".").items()}
+    by_name = unstacked(traverse_util.flatten_dict(params, sep="."))
+    flat = {name: np.asarray(x, np.float32) for name, x in by_name.items()}
     if precision != "int8":
         return {name: x.astype(precision) for name, x in flat.items()}
     stored: dict[str, np.ndarray] = {}
@@ -269,7 +271,7 @@ def _read_params(folder: Path) -> dict[str, np.ndarray]:
     try:
         found = {name: read_tensor(entry) for name, entry in read_header(folder / SINGLE).items()}
         params = {name: x.astype(np.float32) for name, x in found.items() if not name.endswith(SCALE)}
-        return {name: x * found[name + SCALE] if name + SCALE in found else x for name, x in params.items()}
+        return restacked({name: x * found.get(name + SCALE, np.float32(1)) for name, x in params.items()})
     except (ValueError, LookupError) as error:
         raise PolicyError(f"policy is {folder}: {error}") from error
 

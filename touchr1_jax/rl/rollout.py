@@ -15,7 +15,7 @@ from flax import struct
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
-from touchr1_jax.models.lm import LayerCache, PrefixCache
+from touchr1_jax.models.lm import Caches, PrefixCache
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.rl.losses import token_log_probs
@@ -55,7 +55,7 @@ class GreedyAnswers:
     parsed: Parsed
 
 
-DecodeFn = Callable[[Array, Array, PrefixCache, tuple[LayerCache, ...]], tuple[Array, tuple[LayerCache, ...]]]
+DecodeFn = Callable[[Array, Array, PrefixCache, Caches], tuple[Array, Caches]]
 """(token [], t [], prefix, caches) → (logits [V] of token t + 1, caches), for one rollout."""
 
 
@@ -129,7 +129,7 @@ def sample(
     decode: DecodeFn,
     first: Float[Array, "P V"],
     prefix: PrefixCache,
-    empty: tuple[LayerCache, ...],
+    empty: Any,
     key: Array,
     config: SampleConfig,
 ) -> Rollout:

@@ -69,7 +69,7 @@ def test_adapters_on_rows_change_the_decoder_by_their_rank_and_train_the_rest(po
     before, after = first["decoder"], found["decoder"]
     np.testing.assert_array_equal(after["embedding"]["embedding"], before["embedding"]["embedding"])
     for name in ("q_proj", "o_proj"):
-        change = np.asarray(after["layers_0"][name]["kernel"] - before["layers_0"][name]["kernel"])
+        change = np.asarray(after["last_layer"][name]["kernel"] - before["last_layer"][name]["kernel"])
         sizes = np.linalg.svd(change, compute_uv=False)
         assert sizes[0] > 0
         assert sizes[2] < 1e-2 * sizes[0]  # the remainder is the rounding of their sum
@@ -107,7 +107,7 @@ def test_the_decoders_phase_trains_the_decoder_alone_and_returns_its_best_point(
     jax.tree.map(np.testing.assert_array_equal, found, scored[1])
     for name in set(params) - {"decoder"}:
         jax.tree.map(np.testing.assert_array_equal, found[name], params[name])
-    start, second, third = (x["decoder"]["layers_0"]["q_proj"]["kernel"] for x in (params, *scored[1:]))
+    start, second, third = (x["decoder"]["last_layer"]["q_proj"]["kernel"] for x in (params, *scored[1:]))
     assert np.any(start != second)
     assert np.any(second != third)
 

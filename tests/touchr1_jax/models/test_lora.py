@@ -11,7 +11,17 @@ import pytest
 from tests.touchr1_jax import tiny
 from touchr1_jax.models.layers import GatedMLP
 from touchr1_jax.models.lm import Decoder
-from touchr1_jax.models.lora import Adapter, LoraConfig, Trainable, adapt, adapted, init_adapters, kept_share, merge
+from touchr1_jax.models.lora import (
+    Adapter,
+    LoraConfig,
+    Trainable,
+    adapt,
+    adapted,
+    init_adapters,
+    kept_share,
+    merge,
+    with_adapters,
+)
 
 LORA = LoraConfig(rank=3, alpha=6.0)
 MLP = LoraConfig(rank=3, layers=("gate", "up", "down"))
@@ -31,12 +41,12 @@ def loud(adapters):
     return jax.tree.map(draw, adapters)
 
 
-def states(params):
+def states(variables):
     """Hidden states of a prompt of the decoder alone."""
     x = jnp.asarray(np.random.default_rng(0).normal(size=(L, tiny.CONFIG.decoder.hidden_size)), jnp.float32)
     decoder = Decoder(FNS.module.config.decoder)
     positions = jnp.tile(jnp.arange(L), (3, 1))
-    return decoder.apply({"params": params}, x, positions, jnp.ones(L, bool), method=Decoder.states)[0]
+    return decoder.apply(variables, x, positions, jnp.ones(L, bool), method=Decoder.states)[0]
 
 
 def logits(fns, params):
@@ -60,15 +70,14 @@ def test_fresh_adapters_change_nothing():
     base = GatedMLP(5).init(jax.random.key(0), x)["params"]
     adapters = init_adapters(jax.random.key(1), {"decoder": base}, MLP)["decoder"]
     before = GatedMLP(5).apply({"params": base}, x)
-    with adapted(adapters, MLP):
-        np.testing.assert_array_equal(GatedMLP(5).apply({"params": base}, x), before)
-    with adapted(loud(adapters), MLP):
-        assert (GatedMLP(5).apply({"params": base}, x) != before).all()
+    with adapted(MLP):
+        np.testing.assert_array_equal(GatedMLP(5).apply(with_adapters(base, adapters), x), before)
+        assert (GatedMLP(5).apply(with_adapters(base, loud(adapters)), x) != before).all()
     np.testing.assert_array_equal(GatedMLP(5).apply({"params": base}, x), before)
 
 
 def test_adapters_have_the_shapes_of_their_layers(base):
-    layer = init_adapters(jax.random.key(0), base, LORA)["decoder"]["layers_0"]
+    layer = init_adapters(jax.random.key(0), base, LORA)["decoder"]["last_layer"]
     c = FNS.module.config.decoder
     assert set(layer) == {"q_proj", "k_proj", "v_proj", "o_proj", "mlp"}
     assert layer["k_proj"].a.shape == (c.hidden_size, 3)
@@ -93,10 +102,10 @@ def test_gradients_are_those_through_the_merged_parameters(base):
     inner = loud(init_adapters(jax.random.key(0), decoder, LORA))["decoder"]
 
     def ours(adapters):
-        with adapted(adapters, LORA):
-            return jnp.sum(jnp.sin(states(base["decoder"])))
+        with adapted(LORA):
+            return jnp.sum(jnp.sin(states(with_adapters(base["decoder"], adapters))))
 
-    theirs = lambda adapters: jnp.sum(jnp.sin(states(merge(base["decoder"], adapters, LORA))))
+    theirs = lambda adapters: jnp.sum(jnp.sin(states({"params": merge(base["decoder"], adapters, LORA)})))
     for a, b in zip(*(jax.tree.leaves(jax.jit(jax.grad(f))(inner)) for f in (ours, theirs)), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4 * float(jnp.abs(b).max()))
 
@@ -113,7 +122,7 @@ def test_layers_that_are_computed_twice_are_adapted_both_times(base):
 
 def test_only_named_layers_of_named_towers_are_adapted(base):
     config = dataclasses.replace(LORA, layers=("v_proj",))
-    assert paths(init_adapters(jax.random.key(0), base, config)) == {"decoder/layers_0/v_proj"}
+    assert paths(init_adapters(jax.random.key(0), base, config)) == {"decoder/last_layer/v_proj"}
     config = dataclasses.replace(LORA, layers=("qkv", "out"), towers=("tactile", "vision"))
     assert {path.split("/")[0] for path in paths(init_adapters(jax.random.key(0), base, config))} == {
         "tactile",
