@@ -18,7 +18,7 @@ from experiments.core.artifacts import write_bytes
 from experiments.core.context import Context
 from experiments.study.cache import DAMAGED
 from experiments.study.dataset import Dataset
-from experiments.study.policies import publish_policy
+from experiments.study.policies import policy_folder, publish_policy
 from experiments.study.stages import (
     EncodedContacts,
     GRPOArm,
@@ -151,8 +151,10 @@ def supervised(of: StudySeed, *, tactile: Params | None = None, name: str = "", 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TrainedPolicy(StudySeed):
-    """A trained policy of one seed; `noise` is its encoder's noise bank, `evaluation` its answers about `test`."""
+    """A trained policy of one seed, saved in `folder`; `noise` is its encoder's noise bank, `evaluation` its answers
+    about `test`."""
 
+    folder: Path
     params: Params
     test: Features
     noise: Array
@@ -350,7 +352,9 @@ class _Seed(StudySeed):
         for title, variant in self.variants.items():
             if variant.of == name:
                 evaluation = load_answers(self._path(name))
-                trained = TrainedPolicy(**of_study, params=params, test=test, noise=noise, evaluation=evaluation)
+                found: dict[str, Any] = {"params": params, "test": test, "noise": noise, "evaluation": evaluation}
+                found["folder"] = policy_folder(self.context, name, self.seed)
+                trained = TrainedPolicy(**of_study, **found)
                 self._evaluate(title, functools.partial(variant.evaluate, trained))
 
     def _evaluate(self, name: str, evaluate: Callable[[], Evaluation]) -> None:

@@ -141,8 +141,8 @@ def adapted(scale: float) -> AbstractContextManager[None]:
             return y
         if not layer.has_variable(ADAPTERS, "a"):
             return y
-        a, b = (layer.get_variable(ADAPTERS, name).astype(y.dtype) for name in ("a", "b"))
-        return y + scale * linear(linear(args[0].astype(y.dtype), a), b)
+        factor: Callable[[str], Array] = lambda name: layer.get_variable(ADAPTERS, name).astype(y.dtype)
+        return y + scale * linear(linear(args[0].astype(y.dtype), factor("a")), factor("b"))
 
     return nn.intercept_methods(add)
 

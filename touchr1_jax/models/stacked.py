@@ -5,6 +5,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import flax.linen as nn
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 ADAPTERS = "adapters"
@@ -15,6 +17,11 @@ STACKED = frozenset({"layers", "blocks"})
 
 LAST = "last_layer"
 """Name of the module of the decoder's last layer, which stands alone."""
+
+
+LAYER_BY_LAYER = {"xla_disable_hlo_passes": "while-loop-invariant-code-motion"}
+"""Option of programs on weights in bfloat16: XLA multiplies these as float32 on CPUs, and would convert all layers at
+once, before its loop over them."""
 
 
 def scan_layers(each: Callable[..., tuple[Any, Any]], count: int) -> Callable[..., tuple[Any, Any]]:
@@ -31,6 +38,11 @@ def scan_layers(each: Callable[..., tuple[Any, Any]], count: int) -> Callable[..
         length=count,
         check_constancy_invariants=False,
     )
+
+
+def layer_by_layer(weights: Any) -> dict[str, Any]:
+    """Options of the compiler for programs on weights of a type: `LAYER_BY_LAYER` where it is needed."""
+    return LAYER_BY_LAYER if weights == jnp.bfloat16 and jax.default_backend() == "cpu" else {}
 
 
 def unstacked(flat: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from touchr1_jax.models.lora import of_decoder, with_adapters
 from touchr1_jax.models.policy_fns import PolicyFns
-from touchr1_jax.models.stacked import ADAPTERS
+from touchr1_jax.models.stacked import ADAPTERS, layer_by_layer
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.rewards import AnyReward, check_weights, total_reward
 from touchr1_jax.rewards.base import GROUP
@@ -129,7 +129,8 @@ def grpo_program(
         on_base = dataclasses.replace(fns, base=base)
         return make(on_base, score, optimizer, inner, constraint)(state, batch, frozen)
 
-    return optimizer, jax.jit(step, donate_argnums=0, compiler_options=LEAN if config.lean_compilation else None)
+    options = {**layer_by_layer(fns.cache_dtype), **(LEAN if config.lean_compilation else {})}
+    return optimizer, jax.jit(step, donate_argnums=0, compiler_options=options)
 
 
 def check_whole_batch(

@@ -19,7 +19,7 @@ from touchr1_jax.models.chunked_logits import MAX_LOGITS
 from touchr1_jax.models.layers import SizeError
 from touchr1_jax.models.lora import of_decoder, with_adapters
 from touchr1_jax.models.policy_fns import PolicyFns
-from touchr1_jax.models.stacked import ADAPTERS
+from touchr1_jax.models.stacked import ADAPTERS, layer_by_layer
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.training.loop import SILENT, Batches, Hooks, LoopConfig, fit
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
@@ -155,4 +155,4 @@ def sft_program(fns: PolicyFns, config: SFTConfig, blind: bool) -> tuple[optax.G
     def step(state: SFTState, batch: SFTBatch, frozen: Params) -> tuple[SFTState, dict[str, Array]]:
         return make(dataclasses.replace(fns, base=frozen))(state, batch)
 
-    return optimizer, jax.jit(step, donate_argnums=0)
+    return optimizer, jax.jit(step, donate_argnums=0, compiler_options=layer_by_layer(fns.cache_dtype))

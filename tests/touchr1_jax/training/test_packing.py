@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from tests.touchr1_jax import tiny
 from touchr1_jax.models import blocked_attention as attention
-from touchr1_jax.models.lora import LoraConfig, Trainable, adapt, init_adapters
+from touchr1_jax.models.lora import LoraConfig, init_adapters
 from touchr1_jax.models.policy import prompt_mask
 from touchr1_jax.text.template import answer_text, encode_answer
 from touchr1_jax.training.packing import (
@@ -145,9 +145,9 @@ def test_blocks_of_logits_and_rematerialisation_change_nothing(params, batch, pa
 
 def test_adapters_learn_from_rows_what_they_learn_from_padding(params, batch):
     lora = LoraConfig(rank=2)
-    fns = adapt(FNS, params, lora)
+    fns = dataclasses.replace(FNS, lora=lora, base=params)
     adapters = jax.tree.map(lambda x: 0.1 + x, init_adapters(jax.random.key(0), params, lora))
-    trained = Trainable(adapters=adapters, towers={"tactile": params["tactile"]})
+    trained = {"adapters": adapters, "tactile": params["tactile"]}
     found = jax.jit(functools.partial(sft_gradient, fns))
     assert_same(found(trained, packed(batch, Packing(width=WIDTH, contacts=4))), found(trained, batch))
 
