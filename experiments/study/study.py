@@ -151,8 +151,7 @@ def supervised(of: StudySeed, *, tactile: Params | None = None, name: str = "", 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TrainedPolicy(StudySeed):
-    """A trained policy of one seed, saved in `folder`; `noise` is its encoder's noise bank, `evaluation` its answers
-    about `test`."""
+    """A saved policy of one seed; `noise` is its encoder's noise bank, `evaluation` its answers about `test`."""
 
     folder: Path
     params: Params
@@ -352,9 +351,8 @@ class _Seed(StudySeed):
         for title, variant in self.variants.items():
             if variant.of == name:
                 evaluation = load_answers(self._path(name))
-                found: dict[str, Any] = {"params": params, "test": test, "noise": noise, "evaluation": evaluation}
-                found["folder"] = policy_folder(self.context, name, self.seed)
-                trained = TrainedPolicy(**of_study, **found)
+                made: dict[str, Any] = {"params": params, "test": test, "noise": noise, "evaluation": evaluation}
+                trained = TrainedPolicy(**of_study, **made, folder=policy_folder(self.context, name, self.seed))
                 self._evaluate(title, functools.partial(variant.evaluate, trained))
 
     def _evaluate(self, name: str, evaluate: Callable[[], Evaluation]) -> None:

@@ -99,14 +99,8 @@ def first_logits(policy, params, batch):
 
 def test_a_written_policy_describes_itself(folder, saved):
     """Parameters bit by bit, adapters of both towers among them, from the folder and the released weights alone."""
-    names = {
-        "README.md",
-        "config.json",
-        "adapter_config.json",
-        "adapter_model.safetensors",
-        "touch_encoder.safetensors",
-    }
-    assert {path.name for path in folder.iterdir()} == names
+    tensors = {"adapter_model.safetensors", "touch_encoder.safetensors"}
+    assert {path.name for path in folder.iterdir()} == {"README.md", "config.json", "adapter_config.json", *tensors}
     assert [path.name for path in folder.parent.iterdir()] == [folder.name]
     found = read_adapted(folder)
     assert jax.tree.all(jax.tree.map(np.array_equal, found.params, saved.params))
