@@ -6,7 +6,6 @@ products in float32, so that its temporary memory is an upper bound.
 """
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -14,7 +13,6 @@ import jax
 import jax.numpy as jnp
 
 from touchr1_jax.distributed.mesh import MeshConfig
-from touchr1_jax.distributed.rules import state_shardings
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.rl.config import GRPOConfig, left_out
 from touchr1_jax.rl.grpo import FrozenInputs, GRPOState
@@ -67,12 +65,6 @@ def reserved_bytes(compiled: jax.stages.Compiled) -> Compiled:
         found.alias_size_in_bytes,
         found.temp_size_in_bytes,
     )
-
-
-def at_depths(found: Mapping[int, Compiled], layers: int) -> Compiled:
-    """The figures of a decoder of `layers` equal layers from those of two depths: a + b · layers."""
-    (n, shallow), (m, deep) = sorted(found.items())
-    return Compiled(*(a + (layers - n) * (b - a) // (m - n) for a, b in zip(shallow, deep, strict=True)))
 
 
 def held_bytes(mesh: MeshConfig, tree: Any) -> int:
