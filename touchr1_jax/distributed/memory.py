@@ -6,6 +6,7 @@ products in float32, so that its temporary memory is an upper bound.
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from touchr1_jax.distributed.mesh import MeshConfig
+from touchr1_jax.distributed.rules import state_shardings
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.rl.config import GRPOConfig, left_out
 from touchr1_jax.rl.grpo import FrozenInputs, GRPOState
