@@ -94,8 +94,8 @@ class TrainingConfig(SourceConfig):
     """Rewards that every arm earns besides its own, as in `overlong 0.1 diversity 0.05`."""
     grpo_steps: int = 150
     grpo_save_every: int = 150
-    grpo_lora_rank: int = 0
-    """Rank of adapters that GRPO trains in the place of the decoder's weights; 0 trains the weights."""
+    lora: LoraConfig = LoraConfig(rank=0)
+    """Adapters that SFT and GRPO train in the place of the adapted towers' weights; rank 0 trains the weights."""
     samples: int = 8
     """Sampled answers to each test question, for pass@k, maj@k and calibration; 0 asks for greedy answers only."""
 
@@ -116,15 +116,10 @@ class TrainingConfig(SourceConfig):
         """Steps of GRPO and when they are saved."""
         return LoopConfig(steps=self.grpo_steps, save_every=self.grpo_save_every)
 
-    @property
-    def grpo_lora(self) -> LoraConfig | None:
-        """Adapters that GRPO trains, or none."""
-        return LoraConfig(rank=self.grpo_lora_rank) if self.grpo_lora_rank else None
-
     def __post_init__(self) -> None:
         super().__post_init__()
         at_least(self, 1, "seeds", "grpo_save_every", "read_threads", "noise_contacts")
-        at_least(self, 0, "clip_memory_gib", "grpo_steps", "grpo_lora_rank", "samples", "anchor")
+        at_least(self, 0, "clip_memory_gib", "grpo_steps", "samples", "anchor")
         if not self.sft.steps and (self.recipe == "paper" or not self.encoders.steps):
             raise ValueError(
                 f"sft.steps is 0: must be at least 1 where recipe {self.recipe!r} trains the encoders by nothing else; "

@@ -63,9 +63,9 @@ SHALLOW = make_fns(dataclasses.replace(CONFIG, decoder=dataclasses.replace(CONFI
 
 
 def shallow_params(seed: int = 0, *, loud: float = 0.4) -> Params:
-    """Parameters of the decoder of `SHALLOW`: those of `params` without the second layer."""
+    """Parameters of the decoder of `SHALLOW`: those of the last layer of `params`."""
     decoder = params(seed, loud=loud)["decoder"]
-    return {"decoder": {name: value for name, value in decoder.items() if name != "layers_1"}}
+    return {"decoder": {name: value for name, value in decoder.items() if name != "layers"}}
 
 
 @functools.cache

@@ -137,8 +137,8 @@ def test_banned_ids_are_never_sampled(batch):
 def test_empty_cache_has_the_shape_of_the_decoder():
     c = tiny.CONFIG.decoder
     caches = tiny.FNS.empty_cache(7)
-    assert len(caches) == c.num_layers
-    assert caches[0].k.shape == caches[0].v.shape == (c.num_kv_heads, 7, c.head_dim)
+    assert caches.last.k.shape == caches.last.v.shape == (c.num_kv_heads, 7, c.head_dim)
+    assert caches.layers.k.shape == caches.layers.v.shape == (c.num_layers - 1, *caches.last.k.shape)
 
 
 def test_blind_features_hold_no_touch():
