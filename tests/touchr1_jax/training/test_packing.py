@@ -38,7 +38,7 @@ from touchr1_jax.training.sft import (
 
 P, Q, T = 4, 2, 16
 N = tiny.L + T
-FNS = tiny.SHALLOW
+FNS = tiny.FNS  # its last layer attends from few places of a row, the one before from all
 WIDTH = 2 * N
 
 
@@ -90,7 +90,7 @@ def batch():
 
 @pytest.fixture(scope="module")
 def params():
-    return {**tiny.params(), **tiny.shallow_params()}
+    return tiny.params()
 
 
 @functools.cache
