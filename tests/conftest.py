@@ -5,6 +5,7 @@ import gc
 import os
 import tempfile
 from collections.abc import Iterator
+from pathlib import Path
 
 import hypothesis
 import jax
@@ -32,6 +33,9 @@ LEAN = (
     "--xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops,while-loop-constant-sinking"
 )
 """Flags of XLA: one piece of code for the one core of a worker, and no search for what its few rounds might share."""
+
+MOST_RESIDENT_BYTES = 2 * 2**30
+"""Above this a worker drops its programs; kept to the end they would fill 5 GB."""
 
 MADE_BETWEEN_WALKS = 20_000
 """Objects; at Python's 700 the collector walks the traces of a file a dozen times and finds little."""
@@ -68,8 +72,21 @@ def pytest_collection_finish() -> None:
     gc.set_threshold(MADE_BETWEEN_WALKS)
 
 
+def resident_bytes() -> float:
+    """Memory that this process holds now; ∞ on systems that do not tell."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    except FileNotFoundError:
+        return float("inf")
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
 @pytest.fixture(scope="module", autouse=True)
 def forget_programs() -> Iterator[None]:
-    """Drop the compiled programs of each file after it: files have few in common, and by the end they fill 5 GB."""
+    """Drop compiled programs after a file once they fill the memory; until then, small ones serve other files too."""
+    from touchr1_jax.training.compilation import return_memory
+
     yield
-    jax.clear_caches()
+    if resident_bytes() > MOST_RESIDENT_BYTES:
+        jax.clear_caches()
+        return_memory()

@@ -109,6 +109,12 @@ def features(seed: int = 0, p: int = 1) -> Features:
     )
 
 
+@jax.jit
+def copy(tree):
+    """The same on buffers of its own, by one program rather than one for each shape."""
+    return jax.tree.map(jnp.copy, tree)
+
+
 def completions(seed: int, *shape: int) -> jax.Array:
     """Random writable tokens, int32 [*shape]."""
     return jnp.asarray(np.random.default_rng(seed).choice(WRITABLE, shape), jnp.int32)

@@ -89,7 +89,7 @@ def test_untouched_policy_is_the_model(batch):
     model = {"vision": params["vision"]["tower"], "decoder": params["decoder"]}
     whole = jax.jit(lambda p, x: QwenVL(CONFIG).apply({"params": p}, x, (Grid(1, 4, 4),)))(model, inputs)
     theirs = whole[-T - 1 : -1, WRITABLE]
-    np.testing.assert_allclose(ours[:, WRITABLE], theirs, rtol=0, atol=1e-5 * float(jnp.abs(theirs).max()))
+    np.testing.assert_allclose(ours[:, WRITABLE], theirs, rtol=0, atol=1e-5 * float(np.abs(theirs).max()))
 
 
 @pytest.mark.parametrize("what", ["touch", "view", "time"])
@@ -166,9 +166,9 @@ def test_sft_with_adapters_and_a_whole_tactile_encoder():
     towers = {name: x for name, x in params.items() if name not in frozen}
     start = {"adapters": init_adapters(jax.random.key(0), frozen, LORA), **towers}
     optimizer = optax.adam(2e-2)
-    state = SFTState(params=jax.tree.map(jnp.copy, start), opt_state=optimizer.init(start), step=jnp.int32(0))
+    state = SFTState(params=tiny.copy(start), opt_state=optimizer.init(start), step=jnp.int32(0))
     step = over_base(ADAPTING, lambda fns: make_sft_step(fns, optimizer))
-    kept, batch, losses = jax.tree.map(jnp.copy, frozen), sft_batch(), []
+    kept, batch, losses = tiny.copy(frozen), sft_batch(), []
     for _ in range(12):
         state, metrics = step(frozen, state, batch)
         losses.append(float(metrics["loss"]))
