@@ -37,6 +37,9 @@ LEAN = (
 MOST_RESIDENT_BYTES = 2 * 2**30
 """Above this a worker drops its programs; kept to the end they would fill 5 GB."""
 
+MOST_MAPPED = 30_000
+"""So are they above so many mapped sections, of which Linux allows a process 65,530; a program has some hundred."""
+
 MADE_BETWEEN_WALKS = 20_000
 """Objects; at Python's 700 the collector walks the traces of a file a dozen times and finds little."""
 
@@ -72,13 +75,14 @@ def pytest_collection_finish() -> None:
     gc.set_threshold(MADE_BETWEEN_WALKS)
 
 
-def resident_bytes() -> float:
-    """Memory that this process holds now; ∞ on systems that do not tell."""
+def programs_fill_memory() -> bool:
+    """True once this process holds too much memory or too many mapped sections, and on systems that do not tell."""
     try:
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+        mapped = Path("/proc/self/maps").read_bytes().count(b"\n")
     except FileNotFoundError:
-        return float("inf")
-    return pages * os.sysconf("SC_PAGE_SIZE")
+        return True
+    return pages * os.sysconf("SC_PAGE_SIZE") > MOST_RESIDENT_BYTES or mapped > MOST_MAPPED
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -87,6 +91,6 @@ def forget_programs() -> Iterator[None]:
     from touchr1_jax.training.compilation import return_memory
 
     yield
-    if resident_bytes() > MOST_RESIDENT_BYTES:
+    if programs_fill_memory():
         jax.clear_caches()
         return_memory()
