@@ -213,6 +213,8 @@ def _align_one(small: _Small, row: np.ndarray, change: np.ndarray, model: np.nda
     """One touch by damped Gauss-Newton steps; `model` is what each feature adds to each channel, [6, 3, h, w]."""
     ball = small.ball_px
     mask = small.near(row, max(REACH * row[2], 0.6 * ball) + 2)
+    if not mask.any():
+        return row, 1.0  # it has left the picture, and nothing of its change is explained
     x, y, seen, model = small.x[mask], small.y[mask], change[mask].T, model[..., mask].copy()
 
     def residual(candidate: np.ndarray) -> np.ndarray:
