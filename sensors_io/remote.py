@@ -5,7 +5,10 @@ as AWS_ACCESS_KEY_ID and AWS_ENDPOINT_URL.
 """
 
 import contextlib
+import errno
+import fcntl
 import hashlib
+import logging
 import os
 import pathlib
 import re
@@ -22,6 +25,9 @@ CACHE, CACHE_GB = "TOUCHR1_CACHE", "TOUCHR1_CACHE_GB"
 """Variables of the environment: folder of the cache, by default ~/.cache/touchr1, and its size, by default 50 GB."""
 
 _URL = re.compile(r"([a-z][a-z0-9+]+):/+(.+)")  # one slash is left where a URL was made a path
+_LOG = logging.getLogger(__name__)
+_SLOW_S = 10.0  # from which on a line says that a request is waited for
+_AHEAD = 4  # files at once: one stream alone does not fill the line to a store
 _WAITS_S = (0.1, 0.3, 1.0, 3.0, 9.0)
 _T = TypeVar("_T")
 
@@ -49,7 +55,6 @@ class Mirror:
             ) from error
         self._cache = pathlib.Path(os.environ.get(CACHE, "~/.cache/touchr1")).expanduser()
         self._most = int(float(os.environ.get(CACHE_GB, "50")) * 1e9)
-        self._lock = threading.Lock()
 
     def __str__(self) -> str:
         return self.url
@@ -73,23 +78,43 @@ class Mirror:
         state = [str(about.get(key)) for key in ("ETag", "etag", "md5Hash", "size", "LastModified", "created", "mtime")]
         named = hashlib.sha256("\0".join([self.url, name, *state]).encode()).hexdigest()[:24]
         path = self._cache / f"{named}-{name.rpartition('/')[2]}"
-        with self._lock:
-            if not path.exists():
-                self._download(name, path, about["size"])
-            os.utime(path)  # the one that was not read for the longest time goes first
+        if not path.exists():
+            self._cache.mkdir(parents=True, exist_ok=True)
+            self._download(name, path, about["size"])
+        os.utime(path)  # the one that was not read for the longest time goes first
         return path
 
+    def fetch_ahead(self, files: Iterable[tuple[str, int]]) -> None:
+        """Begin to copy files, names and sizes, in their order beside the caller, as many as the cache holds."""
+        held, listed, lock = 0, iter(files), threading.Lock()
+
+        def work() -> None:
+            nonlocal held
+            while True:
+                with lock:
+                    name, size = next(listed, ("", self._most + 1))
+                    held += size
+                if held > self._most:
+                    return
+                with contextlib.suppress(StoreError):  # whoever reads the file meets it too
+                    self.fetch(name, size)
+
+        for _ in range(_AHEAD):
+            threading.Thread(target=work, daemon=True).start()
+
     def _download(self, name: str, path: pathlib.Path, size: int) -> None:
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-        try:
-            self._cache.mkdir(parents=True, exist_ok=True)
-            self._make_room(size)
-            self._retried(lambda: self._store.get_file(f"{self._path}/{name}", str(temporary)), name)
-            if temporary.stat().st_size != size:
-                raise StoreError(f"{self.url}/{name}: {temporary.stat().st_size} of {size} bytes came; run it again")
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        temporary = path.with_name(f".{path.name}.tmp")
+        with temporary.open("ab") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)  # whoever else wants this file waits for it
+            try:
+                if not path.exists():
+                    self._make_room(size)
+                    self._retried(lambda: self._store.get_file(f"{self._path}/{name}", str(temporary)), name)
+                    if (came := temporary.stat().st_size) != size:
+                        raise StoreError(f"{self.url}/{name}: {came} of {size} bytes came; run it again")
+                    temporary.replace(path)
+            finally:
+                temporary.unlink(missing_ok=True)
 
     def _make_room(self, size: int) -> None:
         """Remove what was not read for the longest time until `size` bytes more keep within the bound."""
@@ -126,6 +151,8 @@ class Mirror:
         """The call's value; failures that may pass are tried again, after longer and longer times."""
         where = f"{self.url}/{name}".rstrip("/")
         for wait_s in (*_WAITS_S, None):
+            slow = threading.Timer(_SLOW_S, _LOG.warning, ("%s: no answer for %g s, still waiting", where, _SLOW_S))
+            slow.start()
             try:
                 return call()
             except FileNotFoundError as error:
@@ -133,14 +160,20 @@ class Mirror:
             except PermissionError as error:
                 raise StoreError(f"{where} is refused ({error}): correct the credentials of this store") from error
             except Exception as error:
+                told = f"{where}: {type(error).__name__}: {error}"
                 if type(error).__name__ in ("NoCredentialsError", "PartialCredentialsError", "RefreshError"):
-                    raise StoreError(f"{where}: {error}: set the credentials of this store") from error
+                    raise StoreError(f"{told}: set the credentials of this store") from error
+                if getattr(error, "errno", None) == errno.ENOSPC:
+                    raise StoreError(f"{told}: free some space in {self._cache} and in the store") from error
                 if wait_s is None:
                     raise StoreError(
-                        f"{where}: {type(error).__name__}: {error}, {len(_WAITS_S) + 1} times: wait until the store "
-                        "answers, and run the same command again"
+                        f"{told}, {len(_WAITS_S) + 1} times: wait until the store answers and has room, and run the "
+                        "same command again"
                     ) from error
+                _LOG.warning("%s; trying again in %g s", told, wait_s)
                 time.sleep(wait_s)
+            finally:
+                slow.cancel()
         raise AssertionError
 
 

@@ -11,18 +11,20 @@ import functools
 import hashlib
 import importlib
 import importlib.metadata
+import itertools
 import multiprocessing
 import os
 import pathlib
 import platform
 import shutil
+import signal
 import socket
 import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -57,19 +59,6 @@ class WorkUnit:
     name: str
     run: Callable[[], object]
     done: Callable[[], bool]
-
-
-class Handle(Protocol):
-    """Some units that an engine runs; a future of Python, Ray or submitit."""
-
-    def done(self) -> bool:
-        """True once they have ended."""
-
-    def exception(self) -> BaseException | None:
-        """The error of the worker, if it had one."""
-
-    def result(self) -> dict[str, str]:
-        """Name → error of the units that failed."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -131,17 +120,17 @@ def finish(units: Sequence[WorkUnit], launcher: Launcher, say: Callable[[str], o
 
 def _run(units: Sequence[WorkUnit], launcher: Launcher, say: Callable[[str], object]) -> Iterator[WorkUnit]:
     died, submit, close = _ENGINES[launcher.engine](launcher)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # preemption ends the driver as Control-C does
     size = -(-len(units) // launcher.workers) if launcher.engine == "slurm" else 1  # a job compiles once for its share
     groups = [tuple(units[i : i + size]) for i in range(0, len(units), size)]
     failed = dict[str, str]()
     try:
-        pending: dict[Handle, tuple[tuple[WorkUnit, ...], int]] = {}
-        pending |= {handle: (group, 0) for handle, group in zip(submit(groups), groups, strict=True)}
+        pending = {future: (group, 0) for future, group in zip(submit(groups), groups, strict=True)}
         while pending:
-            for handle in [handle for handle in pending if handle.done()]:
-                group, deaths = pending.pop(handle)
-                error = handle.exception()
-                wrong = {u.name: _line(error) for u in group if not u.done()} if error else handle.result()
+            for future in [future for future in pending if future.done()]:
+                group, deaths = pending.pop(future)
+                error = future.exception()
+                wrong = {u.name: _line(error) for u in group if not u.done()} if error else future.result()
                 yield from (unit for unit in group if unit.name not in wrong)
                 left = tuple(unit for unit in group if unit.name in wrong)
                 if left and isinstance(error, died) and deaths < AGAIN:
@@ -152,6 +141,7 @@ def _run(units: Sequence[WorkUnit], launcher: Launcher, say: Callable[[str], obj
             time.sleep(POLL_S)
     finally:
         close()
+        signal.signal(signal.SIGTERM, before)
     if failed:
         name, why = next(iter(failed.items()))
         raise UnitsError(
@@ -173,7 +163,7 @@ def _local(launcher: Launcher) -> _Engine:
 
     def call(group: tuple[WorkUnit, ...]) -> dict[str, str]:
         if not hasattr(pools, "mine"):
-            pools.mine = concurrent.futures.ProcessPoolExecutor(1, mp_context=context)
+            pools.mine = concurrent.futures.ProcessPoolExecutor(1, context, _end_with_driver)
             made.append(pools.mine)
         try:
             return pools.mine.submit(_work, group, None, os.getcwd()).result()
@@ -182,11 +172,24 @@ def _local(launcher: Launcher) -> _Engine:
             raise
 
     def close() -> None:
+        for process in itertools.chain(*(list((pool._processes or {}).values()) for pool in made)):
+            process.terminate()  # they are idle, or the driver was told to end
         threads.shutdown(cancel_futures=True)
         for pool in made:
             pool.shutdown()
 
     return (BrokenProcessPool,), lambda groups: [threads.submit(call, group) for group in groups], close
+
+
+def _end_with_driver() -> None:
+    """Have this worker end when its driver does, even if that is killed."""
+
+    def wait() -> None:
+        if (driver := multiprocessing.parent_process()) is not None:
+            driver.join()
+            os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def _ray(launcher: Launcher) -> _Engine:
