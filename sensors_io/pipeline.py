@@ -190,8 +190,7 @@ def clip_batches(
     _check_memory(memory, config, workers)
     rows = _checked_rows(indices, len(store))
     dataset = grain.MapDataset.source(rows).seed(seed)
-    if shuffle:
-        dataset = dataset.shuffle()
+    dataset = dataset.shuffle() if shuffle else dataset
     if felt and isinstance(store, RecordStore):
         store.fetch_ahead(dataset[i] for i in range(len(rows)))
     if repeat:

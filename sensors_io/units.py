@@ -119,8 +119,9 @@ def finish(units: Sequence[WorkUnit], launcher: Launcher, say: Callable[[str], o
 
 
 def _run(units: Sequence[WorkUnit], launcher: Launcher, say: Callable[[str], object]) -> Iterator[WorkUnit]:
-    died, submit, close = _ENGINES[launcher.engine](launcher)
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # preemption ends the driver as Control-C does
+    before = signal.getsignal(signal.SIGTERM)
+    died, submit, close = _ENGINES[launcher.engine](launcher)  # Ray takes the signal
+    signal.signal(signal.SIGTERM, signal.default_int_handler if before is signal.SIG_DFL else before)
     size = -(-len(units) // launcher.workers) if launcher.engine == "slurm" else 1  # a job compiles once for its share
     groups = [tuple(units[i : i + size]) for i in range(0, len(units), size)]
     failed = dict[str, str]()

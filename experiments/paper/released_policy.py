@@ -26,8 +26,9 @@ from experiments.core.loops import KEPT
 from experiments.core.progress import in_megabytes
 from experiments.core.results import Table, named_table
 from experiments.study.dataset import Dataset
+from experiments.study.seed import TrainedPolicy
 from experiments.study.stages import encode_rows, untrained
-from experiments.study.study import BLIND, CONTINUED, SFT, TrainedPolicy
+from experiments.study.study import BLIND, CONTINUED, SFT
 from experiments.study.training import TrainingConfig
 from sensors_io.arrays import load_arrays
 from touchr1_jax.distributed.abstract import PromptShape, abstract_grpo

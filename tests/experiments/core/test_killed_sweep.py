@@ -25,9 +25,9 @@ LONGEST_LIFE_S = 5.0
 
 def begin(folder: Path, *options: str) -> subprocess.Popen:
     words = [*SWEEP, "--into", str(folder), "--cache-dir", str(folder.parent / "cache"), *options]
-    log = (folder.parent / "printed.txt").open("a")
     command = [sys.executable, "-m", "tests.experiments.core.noted_sweep", *words]
-    return subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+    with (folder.parent / "printed.txt").open("a") as log:
+        return subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
 
 
 def running(folder: Path) -> list[tuple[str, int]]:
