@@ -35,6 +35,7 @@ from experiments.core.results import Results
 from experiments.core.stopping import Stopped, Stopping
 from experiments.core.text import MEANINGLESS, SMOKE, aligned
 from sensors_io.errors import UserError
+from sensors_io.remote import at_url
 from sensors_io.scenes.backend import require_backend
 from sensors_io.units import HERE, Launcher, LauncherError
 from touchr1_jax.distributed.companions import DifferentProcessesError, watched
@@ -188,6 +189,12 @@ def run_experiment(experiment: Experiment[Any], arguments: Sequence[str], about:
         jsonable(command.config, where="config")
     except (ValueError, LauncherError) as error:  # a configuration refuses its own values, or one is not finite
         print_error(f"{type(error).__name__}: {error}")
+        return 2
+    if at_url(command.runs_dir):
+        print_error(
+            f"runs-dir is {command.runs_dir}: must be a folder, for a run locks, appends to and replaces its files, "
+            "which no store can; name one, and afterwards `export` a policy to the URL"
+        )
         return 2
     for flag in watchers.PACKAGES:
         if getattr(command, flag) and (hint := watchers.missing(flag)):

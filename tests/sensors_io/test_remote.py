@@ -154,10 +154,16 @@ def join() -> None:
             OSError("SlowDown"),
             "OSError: SlowDown, 6 times: wait until the store answers and has room, and run the same command again",
         ),
-        (OSError(errno.ENOSPC, "No space left on device"), "No space left on device: free some space in .*cache"),
+        (
+            OSError(errno.ENOSPC, "No space left on device"),
+            "finds no room .*No space left on device.: free some space in the cache",
+        ),
         (PermissionError("Forbidden"), "is refused .Forbidden.: correct the credentials"),
         (FileNotFoundError("NoSuchBucket"), "is not there .NoSuchBucket.: correct the URL, or make the bucket"),
-        (type("NoCredentialsError", (Exception,), {})("none found"), "none found: set the credentials of this store"),
+        (
+            type("NoCredentialsError", (Exception,), {})("none found"),
+            "is refused .none found.: set the credentials of this store",
+        ),
     ],
     ids=["fails", "full", "refuses", "bucket", "credentials"],
 )
