@@ -4,6 +4,7 @@ import collections
 import dataclasses
 import functools
 import hashlib
+import itertools
 import pathlib
 from collections.abc import Callable
 
@@ -57,15 +58,17 @@ def generate_records(
     per_shard = max(1, records_per_shard // (len(SENSORS) * config.frame_count))
     kept = {f"{path.name.partition('.')[0]}.arrayrecord" for path in out.glob("*.part")}
     with RecordWriter(out, meta=meta, resume=True, kept=kept.__contains__) as writer:
-        for card in object_cards(config):
-            if card.object_id not in writer.objects_done:
-                writer.write_object(card)
         report(writer.contacts_done, config.contact_count)
         units = shard_units(config, out.absolute(), writer.contacts_done, writer.shards_done, per_shard)
         waiting = collections.deque(part_path(out.absolute(), unit.name) for unit in units)
         for stale in set(out.absolute().glob("*.part")) - set(waiting):  # adopted already, or of another division
             stale.unlink()
-        for _ in finish(units, launcher):
+        ended = finish(units, launcher)
+        first = next(ended, None)  # an engine that is not there is named before anything is computed
+        for card in object_cards(config):
+            if card.object_id not in writer.objects_done:
+                writer.write_object(card)
+        for _ in itertools.chain([first], ended):
             while waiting and waiting[0].exists():  # parts are adopted in order
                 writer.adopt(Part.of(read_json(waiting[0])))
                 waiting.popleft().unlink()

@@ -10,7 +10,7 @@ configuration, and says so.  The driver adopts one shard after the other, so tha
 
 Cost: about six minutes on one core, half of it the index; `--scale smoke` one minute.
 
-Expected: some 400 hours of a core and 27 TB; compute limits up to ten machines, the driver from a hundred on, and
+Expected: some 300 hours of a core and 27 TB.  The driver waits for its disk with each shard, so that it limits first;
 larger shards move that limit.
 """
 
