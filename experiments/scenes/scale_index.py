@@ -98,9 +98,8 @@ def _read(root: Path, contacts: int) -> dict[str, float]:
     if found != drawn:
         raise RuntimeError(f"the index finds {found[:3]} where {drawn[:3]} were asked for: mend `ContactTable.find`")
     np.flatnonzero(np.ones(objects, bool)[index.contacts.rows["object"]])  # as `RecordStore.contacts_of_split`
-    return {
-        "open_s": open_s, "open_cpu_s": open_cpu_s, "peak_mb": _memory_mb("VmHWM") - kept, "find_ms": find_ms, "sort_s": sort_s,
-    }  # fmt: skip
+    found_at = {"find_ms": find_ms, "sort_s": sort_s, "peak_mb": _memory_mb("VmHWM") - kept}
+    return {"open_s": open_s, "open_cpu_s": open_cpu_s, **found_at}
 
 
 def _memory_mb(name: str) -> float:
