@@ -2,6 +2,7 @@
 
 import collections
 import dataclasses
+import itertools
 import pathlib
 from collections.abc import Callable, Iterable
 from collections.abc import Sequence as Seq
@@ -39,15 +40,17 @@ def write_by_units(
     """
     kept = {f"{path.name.partition('.')[0]}.arrayrecord" for path in out.glob("*.part")}
     with RecordWriter(out, meta=meta, resume=True, kept=kept.__contains__) as writer:
-        for card in cards:
-            if card.object_id not in writer.objects_done:
-                writer.write_object(card)
         report(writer.contacts_done)
         units = units_from(writer.contacts_done, writer.shards_done)
         waiting = collections.deque(part_path(out.absolute(), unit.name) for unit in units)
         for stale in set(out.absolute().glob("*.part")) - set(waiting):  # adopted already, or of another division
             stale.unlink()
-        for _ in finish(units, launcher):
+        ended = finish(units, launcher)
+        first = next(ended, None)  # an engine that is not there is named before anything is computed
+        for card in cards:
+            if card.object_id not in writer.objects_done:
+                writer.write_object(card)
+        for _ in itertools.chain([first], ended):
             while waiting and waiting[0].exists():  # parts are adopted in order
                 writer.adopt(Part.of(read_json(waiting[0])))
                 waiting.popleft().unlink()

@@ -15,6 +15,7 @@ import grain
 import numpy as np
 
 from sensors_io.augment import AugmentConfig, apply_symmetry, draw_kept, draw_symmetry, jitter_exposure
+from sensors_io.records import RecordStore
 from sensors_io.schema import SENSORS, Clip, ContactKey, Flag, ObjectCard, SchemaError, Sequence
 from sensors_io.selection import Chooser, Shown, choose_frames, field_images, pick_frames
 
@@ -193,8 +194,9 @@ def clip_batches(
     _check_memory(memory, config, workers)
     rows = _checked_rows(indices, len(store))
     dataset = grain.MapDataset.source(rows).seed(seed)
-    if shuffle:
-        dataset = dataset.shuffle()
+    dataset = dataset.shuffle() if shuffle else dataset
+    if felt and isinstance(store, RecordStore):
+        store.fetch_ahead(dataset[i] for i in range(len(rows)))
     if repeat:
         dataset = dataset.repeat()
     # grain rounds the number of batches up in floating point, to 2⁶³ for the 2⁶³ − 1 rows of an endless data set: one

@@ -20,7 +20,7 @@ import fcntl
 import hashlib
 import os
 import pathlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from collections.abc import Sequence as Seq
 from types import TracebackType
 from typing import IO, Any, Self
@@ -308,6 +308,10 @@ class RecordStore:
                 )
             contact[sensor] = sequence
         return contact
+
+    def fetch_ahead(self, contacts: Iterable[int]) -> None:
+        """Begin to copy the shards of contacts from a store, in the order in which these are read."""
+        self._entries.fetch_ahead(int(self.contacts.rows[i]["entry"]) for i in contacts)
 
     def contacts_of_split(self, split: str) -> np.ndarray:
         """Indices of the contacts whose object belongs to a split, int64, ascending.

@@ -5,7 +5,10 @@ as AWS_ACCESS_KEY_ID and AWS_ENDPOINT_URL.
 """
 
 import contextlib
+import errno
+import fcntl
 import hashlib
+import logging
 import os
 import pathlib
 import re
@@ -22,7 +25,17 @@ CACHE, CACHE_GB = "TOUCHR1_CACHE", "TOUCHR1_CACHE_GB"
 """Variables of the environment: folder of the cache, by default ~/.cache/touchr1, and its size, by default 50 GB."""
 
 _URL = re.compile(r"([a-z][a-z0-9+]+):/+(.+)")  # one slash is left where a URL was made a path
+_LOG = logging.getLogger(__name__)
+_SLOW_S = 10.0  # from which on a line says that a request is waited for
+_AHEAD = 4  # files at once: one stream alone does not fill the line to a store
 _WAITS_S = (0.1, 0.3, 1.0, 3.0, 9.0)
+_UNKNOWN = ("is refused", "set the credentials of this store")
+_LASTING = {
+    "FileNotFoundError": ("is not there", "correct the URL, or make the bucket"),
+    "PermissionError": ("is refused", "correct the credentials of this store"),
+    "full": ("finds no room", f"free some space in the cache, {CACHE}, and in the store"),
+    **dict.fromkeys(("NoCredentialsError", "PartialCredentialsError", "RefreshError"), _UNKNOWN),
+}  # failures that do not pass: what is wrong, and the fix
 _T = TypeVar("_T")
 
 
@@ -38,18 +51,17 @@ class Mirror:
     """
 
     def __init__(self, url: str):
-        kind, path = _matched(url)
+        if (found := _URL.fullmatch(url)) is None:
+            raise StoreError(f"url is {url!r}: must be KIND://PATH, as in s3://bucket/records; correct it")
+        kind, path = found.groups()
         self.url, self._path = f"{kind}://{path}", path.rstrip("/")
         try:
             self._store = fsspec.filesystem(kind, use_listings_cache=False)
         except (ImportError, ValueError) as error:
-            raise StoreError(
-                f"{self.url} cannot be opened ({error}): the URL must be of a kind that fsspec knows and its package "
-                "installed; pip install 'touchr1-jax[cloud]'"
-            ) from error
+            fix = "must be of a kind that fsspec knows, its package installed; pip install 'touchr1-jax[cloud]'"
+            raise StoreError(f"{self.url} cannot be opened ({error}): {fix}") from error
         self._cache = pathlib.Path(os.environ.get(CACHE, "~/.cache/touchr1")).expanduser()
         self._most = int(float(os.environ.get(CACHE_GB, "50")) * 1e9)
-        self._lock = threading.Lock()
 
     def __str__(self) -> str:
         return self.url
@@ -73,23 +85,43 @@ class Mirror:
         state = [str(about.get(key)) for key in ("ETag", "etag", "md5Hash", "size", "LastModified", "created", "mtime")]
         named = hashlib.sha256("\0".join([self.url, name, *state]).encode()).hexdigest()[:24]
         path = self._cache / f"{named}-{name.rpartition('/')[2]}"
-        with self._lock:
-            if not path.exists():
-                self._download(name, path, about["size"])
-            os.utime(path)  # the one that was not read for the longest time goes first
+        if not path.exists():
+            self._cache.mkdir(parents=True, exist_ok=True)
+            self._download(name, path, about["size"])
+        os.utime(path)  # the one that was not read for the longest time goes first
         return path
 
+    def fetch_ahead(self, files: Iterable[tuple[str, int]]) -> None:
+        """Begin to copy files, names and sizes, in their order beside the caller, as many as the cache holds."""
+        held, listed, lock = 0, iter(files), threading.Lock()
+
+        def work() -> None:
+            nonlocal held
+            while True:
+                with lock:
+                    name, size = next(listed, ("", self._most + 1))
+                    held += size
+                if held > self._most:
+                    return
+                with contextlib.suppress(StoreError):  # whoever reads the file meets it too
+                    self.fetch(name, size)
+
+        for _ in range(_AHEAD):
+            threading.Thread(target=work, daemon=True).start()
+
     def _download(self, name: str, path: pathlib.Path, size: int) -> None:
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-        try:
-            self._cache.mkdir(parents=True, exist_ok=True)
-            self._make_room(size)
-            self._retried(lambda: self._store.get_file(f"{self._path}/{name}", str(temporary)), name)
-            if temporary.stat().st_size != size:
-                raise StoreError(f"{self.url}/{name}: {temporary.stat().st_size} of {size} bytes came; run it again")
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        temporary = path.with_name(f".{path.name}.tmp")
+        with temporary.open("ab") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)  # whoever else wants this file waits for it
+            try:
+                if not path.exists():
+                    self._make_room(size)
+                    self._retried(lambda: self._store.get_file(f"{self._path}/{name}", str(temporary)), name)
+                    if (came := temporary.stat().st_size) != size:
+                        raise StoreError(f"{self.url}/{name}: {came} of {size} bytes came; run it again")
+                    temporary.replace(path)
+            finally:
+                temporary.unlink(missing_ok=True)
 
     def _make_room(self, size: int) -> None:
         """Remove what was not read for the longest time until `size` bytes more keep within the bound."""
@@ -104,14 +136,29 @@ class Mirror:
             file.unlink(missing_ok=True)
             held -= bytes_
 
+    def files(self) -> dict[str, str]:
+        """File → MD5 where the store tells one; nothing where the folder does not exist yet."""
+
+        def listed() -> list[dict[str, Any]]:
+            with contextlib.suppress(FileNotFoundError):
+                return list(self._store.ls(self._path, detail=True))
+            return []
+
+        found = self._retried(listed, "")
+        return {one["name"].rpartition("/")[2]: str(one.get("ETag", "")).strip('"') for one in found}
+
+    def copy(self, folder: pathlib.Path) -> None:
+        """Show all files of the URL in a folder on this machine, under their own names."""
+        for name in self.files():
+            (folder / name).symlink_to(self.fetch(name).absolute())
+
     def publish(self, folder: pathlib.Path, names: Iterable[str]) -> int:
         """Upload files of a folder in this order, each verified; those of which the store has the MD5 are left.
 
         Returns:
           Bytes that were uploaded.
         """
-        sent = 0
-        there = self._retried(lambda: _checksums(self._store, self._path), "")
+        sent, there = 0, self.files()
         for name in names:
             size, target = (folder / name).stat().st_size, f"{self._path}/{name}"
             if there.get(name) != _md5(folder / name):
@@ -126,26 +173,27 @@ class Mirror:
         """The call's value; failures that may pass are tried again, after longer and longer times."""
         where = f"{self.url}/{name}".rstrip("/")
         for wait_s in (*_WAITS_S, None):
+            slow = threading.Timer(_SLOW_S, _LOG.warning, ("%s: no answer for %g s, still waiting", where, _SLOW_S))
+            slow.daemon = True
+            slow.start()
             try:
                 return call()
-            except FileNotFoundError as error:
-                raise StoreError(f"{where} is not there ({error}): correct the URL, or make the bucket") from error
-            except PermissionError as error:
-                raise StoreError(f"{where} is refused ({error}): correct the credentials of this store") from error
             except Exception as error:
-                if type(error).__name__ in ("NoCredentialsError", "PartialCredentialsError", "RefreshError"):
-                    raise StoreError(f"{where}: {error}: set the credentials of this store") from error
+                full = getattr(error, "errno", None) == errno.ENOSPC
+                if lasting := _LASTING.get("full" if full else type(error).__name__):
+                    raise StoreError(f"{where} {lasting[0]} ({error}): {lasting[1]}") from error
+                told = f"{where}: {type(error).__name__}: {error}"
                 if wait_s is None:
-                    raise StoreError(
-                        f"{where}: {type(error).__name__}: {error}, {len(_WAITS_S) + 1} times: wait until the store "
-                        "answers, and run the same command again"
-                    ) from error
+                    fix = "wait until the store answers and has room, and run the same command again"
+                    raise StoreError(f"{told}, {len(_WAITS_S) + 1} times: {fix}") from error
+                _LOG.warning("%s; trying again in %g s", told, wait_s)
                 time.sleep(wait_s)
+            finally:
+                slow.cancel()
         raise AssertionError
 
 
-Place = pathlib.Path | Mirror
-"""A folder on this machine, or at a URL."""
+Place = pathlib.Path | Mirror  # a folder on this machine, or at a URL
 
 
 def at_url(path: str | os.PathLike[str]) -> bool:
@@ -161,22 +209,6 @@ def place(path: str | os.PathLike[str]) -> Place:
 def local(root: Place, name: str, size: int | None = None) -> pathlib.Path:
     """A file of a folder on this machine; see `Mirror.fetch`."""
     return root / name if isinstance(root, pathlib.Path) else root.fetch(name, size)
-
-
-def _matched(url: str) -> tuple[str, str]:
-    found = _URL.fullmatch(url)
-    if found is None:
-        raise StoreError(f"url is {url!r}: must be KIND://PATH, as in s3://bucket/records; correct it")
-    return found[1], found[2]
-
-
-def _checksums(store: Any, path: str) -> dict[str, str]:
-    """File → MD5 of a folder of a store where it tells one; nothing where the folder does not exist yet."""
-    try:
-        listed = store.ls(path, detail=True)
-    except FileNotFoundError:
-        return {}
-    return {one["name"].rpartition("/")[2]: str(one.get("ETag", "")).strip('"') for one in listed}
 
 
 def _md5(path: pathlib.Path) -> str:

@@ -4,7 +4,7 @@ import collections
 import os
 import pathlib
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from typing import TypeVar
 
 import numpy as np
@@ -12,7 +12,7 @@ from array_record.python.array_record_data_source import ArrayRecordDataSource
 from array_record.python.array_record_module import ArrayRecordReader, ArrayRecordWriter
 
 from sensors_io.codec import CorruptRecordsError, RecordsError
-from sensors_io.remote import Place, local
+from sensors_io.remote import Mirror, Place, local
 from sensors_io.tables import SHARD
 
 _OPTIONS = "group_size:1,zstd:1"
@@ -87,6 +87,22 @@ class Entries:
             raise CorruptRecordsError(
                 f"{file}, entry {place}: {error}; copy the file again from its source, or write the records again"
             ) from error
+
+    def fetch_ahead(self, entries: Iterable[int]) -> None:
+        """Begin to copy the files of entries, in their order, if they lie at a URL."""
+        if isinstance(self._root, Mirror):
+            self._root.fetch_ahead(self._files(entries))
+
+    def _files(self, entries: Iterable[int]) -> Iterator[tuple[str, int]]:
+        """Name and bytes of the files of entries, each once."""
+        seen = set[int]()
+        for i in entries:
+            shard = int(np.searchsorted(self._ends, i, side="right"))
+            if shard not in seen:
+                seen.add(shard)
+                yield shard_file(self._kind, self._shards["number"][shard]), int(self._shards["bytes"][shard])
+            if len(seen) == len(self._shards):
+                return
 
     def _source(self, shard: int) -> ArrayRecordDataSource:
         with self._lock:

@@ -11,28 +11,27 @@ import functools
 import hashlib
 import importlib
 import importlib.metadata
+import itertools
 import multiprocessing
 import os
 import pathlib
 import platform
 import shutil
+import signal
 import socket
 import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from sensors_io.errors import UserError
 
-AGAIN = 8
-"""Times that a unit is run again after its worker died: one that needs more memory than there is must end."""
-
+AGAIN = 8  # times that a unit is run again after its worker died: one that needs more memory than there is must end
 POLL_S = 0.02
-
 _PACKAGES = ("jax", "jaxlib", "numpy", "flax", "optax", "grain", "array-record")
 
 
@@ -57,19 +56,6 @@ class WorkUnit:
     name: str
     run: Callable[[], object]
     done: Callable[[], bool]
-
-
-class Handle(Protocol):
-    """Some units that an engine runs; a future of Python, Ray or submitit."""
-
-    def done(self) -> bool:
-        """True once they have ended."""
-
-    def exception(self) -> BaseException | None:
-        """The error of the worker, if it had one."""
-
-    def result(self) -> dict[str, str]:
-        """Name → error of the units that failed."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -99,8 +85,7 @@ class Launcher:
         return self.engine == "local" and self.workers == 1
 
 
-HERE = Launcher()
-"""This process."""
+HERE = Launcher()  # this process
 
 
 def finish(units: Sequence[WorkUnit], launcher: Launcher, say: Callable[[str], object] = print) -> Iterator[WorkUnit]:
@@ -115,12 +100,9 @@ def finish(units: Sequence[WorkUnit], launcher: Launcher, say: Callable[[str], o
       LauncherError: before anything is computed.
       UnitsError: after all the others are done.
     """
-    missing = []
-    for unit in units:
-        if unit.done():
-            yield unit
-        else:
-            missing.append(unit)
+    done = [unit.done() for unit in units]
+    yield from itertools.compress(units, done)
+    missing = [unit for unit, there in zip(units, done, strict=True) if not there]
     if launcher.here:
         for unit in missing:
             unit.run()
@@ -130,18 +112,19 @@ def finish(units: Sequence[WorkUnit], launcher: Launcher, say: Callable[[str], o
 
 
 def _run(units: Sequence[WorkUnit], launcher: Launcher, say: Callable[[str], object]) -> Iterator[WorkUnit]:
-    died, submit, close = _ENGINES[launcher.engine](launcher)
+    before = signal.getsignal(signal.SIGTERM)
+    died, submit, close = _ENGINES[launcher.engine](launcher)  # Ray takes the signal
+    signal.signal(signal.SIGTERM, signal.default_int_handler if before is signal.SIG_DFL else before)
     size = -(-len(units) // launcher.workers) if launcher.engine == "slurm" else 1  # a job compiles once for its share
     groups = [tuple(units[i : i + size]) for i in range(0, len(units), size)]
     failed = dict[str, str]()
     try:
-        pending: dict[Handle, tuple[tuple[WorkUnit, ...], int]] = {}
-        pending |= {handle: (group, 0) for handle, group in zip(submit(groups), groups, strict=True)}
+        pending = {future: (group, 0) for future, group in zip(submit(groups), groups, strict=True)}
         while pending:
-            for handle in [handle for handle in pending if handle.done()]:
-                group, deaths = pending.pop(handle)
-                error = handle.exception()
-                wrong = {u.name: _line(error) for u in group if not u.done()} if error else handle.result()
+            for future in [future for future in pending if future.done()]:
+                group, deaths = pending.pop(future)
+                error = future.exception()
+                wrong = {u.name: _line(error) for u in group if not u.done()} if error else future.result()
                 yield from (unit for unit in group if unit.name not in wrong)
                 left = tuple(unit for unit in group if unit.name in wrong)
                 if left and isinstance(error, died) and deaths < AGAIN:
@@ -152,16 +135,14 @@ def _run(units: Sequence[WorkUnit], launcher: Launcher, say: Callable[[str], obj
             time.sleep(POLL_S)
     finally:
         close()
+        signal.signal(signal.SIGTERM, before)
     if failed:
         name, why = next(iter(failed.items()))
-        raise UnitsError(
-            f"{len(failed)} of {len(units)} units failed, the first {name}: {why}; the others stay: mend it and run "
-            "the same command again"
-        )
+        counts = f"{len(failed)} of {len(units)} units failed, the first {name}: {why}"
+        raise UnitsError(f"{counts}; the others stay: mend it and run the same command again")
 
 
-_Group = tuple[WorkUnit, ...]
-_Engine = tuple[tuple[type[BaseException], ...], Callable[[Sequence[_Group]], list[Any]], Callable[[], object]]
+_Engine = tuple[tuple[type[BaseException], ...], Callable[[Sequence[Any]], list[Any]], Callable[[], object]]
 """Errors of a worker that died, the function that submits groups of units, and the one that ends the engine."""
 
 
@@ -173,7 +154,7 @@ def _local(launcher: Launcher) -> _Engine:
 
     def call(group: tuple[WorkUnit, ...]) -> dict[str, str]:
         if not hasattr(pools, "mine"):
-            pools.mine = concurrent.futures.ProcessPoolExecutor(1, mp_context=context)
+            pools.mine = concurrent.futures.ProcessPoolExecutor(1, context, _end_with_driver)
             made.append(pools.mine)
         try:
             return pools.mine.submit(_work, group, None, os.getcwd()).result()
@@ -182,11 +163,17 @@ def _local(launcher: Launcher) -> _Engine:
             raise
 
     def close() -> None:
+        for process in itertools.chain(*(list((pool._processes or {}).values()) for pool in made)):
+            process.terminate()  # they are idle, or the driver was told to end
         threads.shutdown(cancel_futures=True)
-        for pool in made:
-            pool.shutdown()
 
     return (BrokenProcessPool,), lambda groups: [threads.submit(call, group) for group in groups], close
+
+
+def _end_with_driver() -> None:
+    """Have this worker end when its driver does, even if that is killed."""
+    driver: Any = multiprocessing.parent_process()
+    threading.Thread(target=lambda: os._exit(bool(driver.join())), daemon=True).start()
 
 
 def _ray(launcher: Launcher) -> _Engine:
@@ -203,8 +190,8 @@ def _ray(launcher: Launcher) -> _Engine:
         except Exception as error:  # a node that does not start raises it bare
             where = f"answers at {launcher.address!r}" if launcher.address else "starts here"
             raise LauncherError(
-                f"no Ray cluster {where} ({' '.join(str(error).split())[:200]}): start one by `ray start --head`, with "
-                "the same versions, and name it by --launcher.address"
+                f"no Ray cluster {where} ({_line(error)[:200]}): start one by `ray start --head`, with the same "
+                "versions, and name it by --launcher.address"
             ) from error
     node = importlib.import_module("ray.util.scheduling_strategies").NodeAffinitySchedulingStrategy
     asked = ray.remote(num_cpus=0, max_retries=0)(check_versions)
@@ -212,8 +199,9 @@ def _ray(launcher: Launcher) -> _Engine:
         alive = [one["NodeID"] for one in ray.nodes() if one["Alive"]]
         ray.get([asked.options(scheduling_strategy=node(n, soft=False)).remote(versions()) for n in alive])
     except ray.exceptions.RayError as error:
-        cause = getattr(error, "cause", None)
-        raise LauncherError(str(cause) if isinstance(cause, LauncherError) else _foreign(error)) from error
+        cause, last = getattr(error, "cause", None), str(error).strip().splitlines()[-1]
+        foreign = f"a worker cannot import this project ({last}): install the same version of it on all machines"
+        raise LauncherError(str(cause) if isinstance(cause, LauncherError) else foreign) from error
     died = tuple(getattr(ray.exceptions, name) for name in ("WorkerCrashedError", "NodeDiedError", "OutOfMemoryError"))
     work = ray.remote(num_cpus=1, max_retries=0)(_work)
     where = os.getcwd()
@@ -226,19 +214,14 @@ def _slurm(launcher: Launcher) -> _Engine:
     submitit = _engine("submitit", "slurm")
     here = launcher.partition == "local"
     if not here and shutil.which("sbatch") is None:
-        raise LauncherError(
-            "no Slurm cluster is here (sbatch is not found): run this on its login node, or set --launcher local"
-        )
+        fix = "run this on its login node, or set --launcher local"
+        raise LauncherError(f"no Slurm cluster is here (sbatch is not found): {fix}")
     executor = submitit.AutoExecutor(folder=pathlib.Path(".submitit").absolute(), cluster="local" if here else "slurm")
-    executor.update_parameters(name="touchr1", timeout_min=24 * 60)
-    if not here:
-        executor.update_parameters(slurm_array_parallelism=launcher.workers)
-    if launcher.partition and not here:
-        executor.update_parameters(slurm_partition=launcher.partition)
-    died, work = (
-        submitit.core.utils.UncompletedJobError,
-        functools.partial(_work, expected=versions(), where=os.getcwd()),
-    )
+    partition = {"slurm_partition": launcher.partition} if launcher.partition else {}
+    own = {} if here else {"slurm_array_parallelism": launcher.workers, **partition}
+    executor.update_parameters(name="touchr1", timeout_min=24 * 60, **own)
+    work = functools.partial(_work, expected=versions(), where=os.getcwd())
+    died = submitit.core.utils.UncompletedJobError
     return (died,), lambda groups: executor.map_array(work, groups), lambda: None
 
 
@@ -271,15 +254,8 @@ def _engine(package: str, extra: str) -> Any:
     try:
         return importlib.import_module(package)
     except ImportError as error:
-        raise LauncherError(
-            f"--launcher {extra} needs {package}, which is not installed: pip install 'touchr1-jax[{extra}]'"
-        ) from error
-
-
-def _foreign(error: BaseException) -> str:
-    """A worker that cannot even say what it has installed."""
-    last = str(error).strip().splitlines()[-1]
-    return f"a worker cannot import this project ({last}): install the same version of it on all machines"
+        fix = f"pip install 'touchr1-jax[{extra}]'"
+        raise LauncherError(f"--launcher {extra} needs {package}, which is not installed: {fix}") from error
 
 
 @functools.cache
@@ -302,7 +278,5 @@ def check_versions(expected: Mapping[str, str]) -> None:
     """
     for name, version in versions().items():
         if version != expected.get(name):
-            raise LauncherError(
-                f"worker {socket.gethostname()} has {name} {version}, the driver {expected.get(name)}: results would "
-                "differ; install the same versions on all machines"
-            )
+            differs = f"worker {socket.gethostname()} has {name} {version}, the driver {expected.get(name)}"
+            raise LauncherError(f"{differs}: results would differ; install the same versions on all machines")

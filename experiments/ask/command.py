@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import json
 import sys
+import tempfile
 import threading
 import webbrowser
 from collections.abc import Iterator, Sequence
@@ -27,10 +28,12 @@ from experiments.core.runner import COMPILED
 from experiments.study.policies import find_policy, is_policy, measured_figures
 from sensors_io.errors import UserError
 from sensors_io.records import RecordStore
+from sensors_io.remote import Mirror, at_url
 from sensors_io.scenes.backend import require_backend
 from touchr1_jax.asking import HUB, AskablePolicy, push
 from touchr1_jax.models.adapted_folder import export_merged
 from touchr1_jax.models.load import WeightsError
+from touchr1_jax.models.qwen.config import CONFIG_FILE
 from touchr1_jax.models.released_policy import ReleasedPolicy
 from touchr1_jax.models.saved_policy import Precision, SavedPolicy, save_policy
 from touchr1_jax.text.plain_questions import QuestionError
@@ -129,12 +132,12 @@ class AskCommand(Places):
 class ExportCommand(Places):
     """Write a trained policy as a folder in the layout of model hubs: config, safetensors, tokenizer, model card.
 
-    The folder is a POLICY of `ask`; so is a policy of the hub, hub:USER/NAME, which this command also copies.  A policy
+    The folder is a POLICY of `ask`; so is a URL such as s3://bucket/policy, and hub:USER/NAME on the hub.  A policy
     with adapters on released weights is merged into them, in float32, as a folder of the released format.
     """
 
     policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
-    folder: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER|hub:USER/NAME")]
+    folder: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER|URL|hub:USER/NAME")]
     precision: Precision = "float32"
     """Of the parameters: int8 takes a quarter of the bytes."""
     weights: Path | None = None
@@ -156,6 +159,12 @@ class ExportCommand(Places):
         if self.folder.startswith(HUB):
             print_lines(push(saved, self.folder.removeprefix(HUB), precision=self.precision, card=card))
             return 0
+        if at_url(self.folder):
+            with tempfile.TemporaryDirectory() as folder:
+                save_policy(Path(folder), saved, precision=self.precision, card=card)
+                names = sorted((path.name for path in Path(folder).iterdir()), key=CONFIG_FILE.__eq__)  # that one last
+                print_lines(f"{self.folder}: {Mirror(self.folder).publish(Path(folder), names) / 1e6:.2f} MB were sent")
+            return 0
         save_policy(Path(self.folder), saved, precision=self.precision, card=card)
         size = sum(path.stat().st_size for path in Path(self.folder).iterdir())
         print_lines(f"{self.folder}: {size / 1e6:.2f} MB")
@@ -163,7 +172,8 @@ class ExportCommand(Places):
 
     def _merged(self, saved: SavedPolicy) -> int:
         """Released weights with the adapters in them."""
-        if self.folder.startswith(HUB) or self.precision != "float32" or self.card is not None:
+        elsewhere = self.folder.startswith(HUB) or at_url(self.folder)
+        if elsewhere or self.precision != "float32" or self.card is not None:
             raise DataError(
                 f"folder is {self.folder!r}, precision {self.precision}: a policy with adapters is merged into a "
                 "folder in float32, without --card; leave the options out, or publish its own folder as it is"

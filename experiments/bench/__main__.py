@@ -13,17 +13,18 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.bench.contacts import measure_split, read_source
-from experiments.core.artifacts import write_json
+from experiments.bench.score_units import score_units
+from experiments.core.artifacts import read_json, write_json
 from experiments.core.text import number
 from sensors_io.commands.console import complain, print_in_any_encoding, progress_bar
 from sensors_io.errors import UserError
 from sensors_io.records import RecordStore
+from sensors_io.units import HERE, Launcher, finish
 from touchr1_jax.bench.items import ItemError, read_items, write_items
 from touchr1_jax.bench.json_lines import LinesError, read_lines, write_lines
 from touchr1_jax.bench.people import annotate, audit
 from touchr1_jax.bench.people.sheets import SheetError
 from touchr1_jax.bench.questions import card
-from touchr1_jax.bench.questions.answers import average_line, metric_rows, parsed_share, read_answers
 from touchr1_jax.bench.questions.contacts import ContactError
 from touchr1_jax.bench.questions.draw import Quota, QuotaError
 from touchr1_jax.bench.questions.generate import (
@@ -35,6 +36,7 @@ from touchr1_jax.bench.questions.generate import (
     rejected_rows,
 )
 from touchr1_jax.bench.questions.rules import FilteredItems, apply_rules
+from touchr1_jax.bench.scoring import BENCH_METRICS
 
 OUT = Console(highlight=False)
 
@@ -106,25 +108,28 @@ class Score:
     """Score anybody's answers: every metric with its interval over objects, and the average if all parts are there.
 
     An answer is {"id", "text"}, the text in the three segments; a question without an answer counts as unparsable.
+    What was scored before is not scored again.
     """
 
     items: tyro.conf.Positional[Path]
-    answers: tyro.conf.Positional[Path]
-    """File of the answers, JSON Lines."""
+    answers: tyro.conf.Positional[tuple[Path, ...]]
+    """Files of answers, JSON Lines, one for each model."""
     by_sight: Path | None = None
     """File of the answers given the picture alone, which define which questions are a conflict."""
+    cache_dir: Path = Path("data")
+    """Folder that keeps the scores."""
+    launcher: Annotated[Launcher, tyro.conf.arg(name="")] = HERE
 
     def run(self) -> int:
-        items = read_items(self.items)
-        read = lambda path: read_answers(read_lines(path), items, str(path))
-        answers = read(self.answers)
-        table = Table("metric", "", "95 %, over objects", "values", "meaning")
-        for row in metric_rows(items, answers, None if self.by_sight is None else read(self.by_sight)):
-            found, metric = row.interval, row.metric
-            mean, low, high = (format(x, metric.format) for x in (found.mean, found.low, found.high))
-            table.add_row(metric.title, mean, f"{low} – {high}", str(row.values), metric.meaning)
-        OUT.print(table)
-        OUT.print(f"parsed {100 * parsed_share(answers):.1f} %; {average_line(items, answers)}")
+        units = score_units(self.items, self.answers, self.by_sight, self.cache_dir)
+        tuple(finish([unit for unit, _ in units.values()], self.launcher, OUT.print))
+        for path, (_, scores) in units.items():
+            table, found = Table("metric", "", "95 %, over objects", "values", "meaning"), read_json(scores)
+            for name, row in found["rows"].items():
+                metric = BENCH_METRICS[name]
+                mean, low, high = (format(row[end], metric.format) for end in ("mean", "low", "high"))
+                table.add_row(metric.title, mean, f"{low} – {high}", str(row["values"]), metric.meaning)
+            OUT.print(*([path] if len(units) > 1 else []), table, found["said"], sep="\n")
         return 0
 
 

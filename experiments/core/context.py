@@ -26,6 +26,7 @@ from experiments.core.artifacts import (
 from experiments.core.progress import Advance, Loop, ProgressCallback, TrainingSample, Watcher, show_progress
 from experiments.core.stopping import Stopping
 from sensors_io.json_files import CHECKSUM, seal, unseal
+from sensors_io.units import HERE, Launcher
 from touchr1_jax.distributed.processes import SINGLE_PROCESS, ProcessGroup, SingleDevice
 
 T = TypeVar("T")
@@ -95,6 +96,7 @@ class Context:
       stopping: receives the signals that ask the run to stop; the default receives none.
       processes: of which the first alone writes.
       devices: of the training steps.
+      launcher: where units of work run.
     """
 
     def __init__(
@@ -106,6 +108,7 @@ class Context:
         stopping: Stopping | None = None,
         processes: ProcessGroup = SINGLE_PROCESS,
         devices: SingleDevice | None = None,
+        launcher: Launcher = HERE,
     ) -> None:
         self.directory = directory
         self._timing_file = directory / "timing.json"
@@ -114,6 +117,7 @@ class Context:
         self.stopping = stopping or Stopping()
         self.processes = processes
         self.devices = devices or SingleDevice()
+        self.launcher = launcher
         self._opened = time.monotonic()
         self._watchers = watchers
         self.loops: list[Loop] = []

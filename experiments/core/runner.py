@@ -35,7 +35,9 @@ from experiments.core.results import Results
 from experiments.core.stopping import Stopped, Stopping
 from experiments.core.text import MEANINGLESS, SMOKE, aligned
 from sensors_io.errors import UserError
+from sensors_io.remote import at_url
 from sensors_io.scenes.backend import require_backend
+from sensors_io.units import HERE, Launcher, LauncherError
 from touchr1_jax.distributed.companions import DifferentProcessesError, watched
 from touchr1_jax.distributed.processes import (
     Accelerators,
@@ -63,7 +65,17 @@ HELP_ALL = "--help-all"
 FIRST = ("scale", "fresh", "seeds", "data", "data-dir", "scenes.objects", "recipe", "grpo-steps", "grpo.lr-scale")
 """Options that help shows first, where an experiment has them; then come the experiment's own."""
 
-OF_RUNNER = ("tensorboard", "wandb", "runs-dir", "cache-dir", "distributed", "coordinator", "processes", "process")
+OF_RUNNER = (
+    "tensorboard",
+    "wandb",
+    "runs-dir",
+    "cache-dir",
+    "distributed",
+    "coordinator",
+    "processes",
+    "process",
+    "launcher",
+)
 """Options of every experiment."""
 
 MOST_OPTIONS, MOST_LETTERS = 10, 70
@@ -175,15 +187,24 @@ def run_experiment(experiment: Experiment[Any], arguments: Sequence[str], about:
     try:
         command = parse(experiment, arguments, about)
         jsonable(command.config, where="config")
-    except ValueError as error:  # a configuration refuses its own values, or one is not finite
+    except (ValueError, LauncherError) as error:  # a configuration refuses its own values, or one is not finite
         print_error(f"{type(error).__name__}: {error}")
+        return 2
+    if at_url(command.runs_dir):
+        print_error(
+            f"runs-dir is {command.runs_dir}: must be a folder, for a run locks, appends to and replaces its files, "
+            "which no store can; name one, and afterwards `export` a policy to the URL"
+        )
         return 2
     for flag in watchers.PACKAGES:
         if getattr(command, flag) and (hint := watchers.missing(flag)):
             print_error(hint)
             return 2
-    if not experiment.spreads and command.launch != Launch():
-        print_error(f"{experiment.name} runs in one process on one device; leave --distributed and --mesh out")
+    if not experiment.spreads and (command.launch != Launch() or command.launcher != HERE):
+        print_error(f"{experiment.name} runs in one process on one device; leave --distributed, --mesh, --launcher out")
+        return 2
+    if command.launch.distributed and command.launcher != HERE:
+        print_error("--distributed and --launcher both spread the run: leave one out")
         return 2
     with compiled_quickly() if command.scale in experiment.quick else contextlib.nullcontext():
         return _execute(experiment, command, about, shlex.join([*PROG.split(), experiment.name, *arguments]))
@@ -215,6 +236,7 @@ def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> 
             ("runs_dir", Annotated[Path, tyro.conf.arg(help="Folder of all runs.")], Path("runs")),
             ("cache_dir", Annotated[Path, tyro.conf.arg(help="Folder of data and compiled programs.")], Path("data")),
             ("launch", Annotated[Launch, tyro.conf.arg(name="")], Launch()),
+            ("launcher", Annotated[Launcher, tyro.conf.arg(name="")], HERE),
             ("config", Annotated[type(experiment.config), tyro.conf.arg(name="")], configs[scale]),
         ],
         kw_only=True,
@@ -325,7 +347,13 @@ def _compute(
     """Compute and, in the process that writes, publish; an error that ends the run is shown on its page."""
     devices = select_devices(command.launch)
     make_context = functools.partial(
-        Context, directory, command.cache_dir, stopping=stopping, processes=processes, devices=devices
+        Context,
+        directory,
+        command.cache_dir,
+        stopping=stopping,
+        processes=processes,
+        devices=devices,
+        launcher=command.launcher,
     )
     if not processes.writes:
         with contextlib.closing(make_context(Console(quiet=True))) as context:

@@ -11,6 +11,7 @@ import functools
 import hashlib
 import itertools
 import json
+import os
 import shlex
 import signal
 import time
@@ -36,14 +37,10 @@ from touchr1_jax.bench.scoring import REPORTED
 FOLDERS = "sweeps"
 """Folder of the sweeps in the folder of all runs."""
 
-DIGITS = 8
-"""Of a hash in a name."""
+DIGITS = 8  # of a hash in a name
+MOST = 6  # figures of a table whose figures nobody chose
 
-MOST = 6
-"""Figures of a table whose figures nobody chose."""
-
-MAIN = ("acc", "avg", "omae")
-"""Metrics of a table of arms whose figures nobody chose."""
+MAIN = ("acc", "avg", "omae")  # metrics of a table of arms whose figures nobody chose
 
 WIDE = 20.0
 """Largest over smallest value from which on an axis is logarithmic."""
@@ -267,7 +264,10 @@ def _run_unit(name: str, package: str, unit: SweepUnit) -> None:
     while (run := unit.run) is not None and run.in_use and time.monotonic() < until:
         time.sleep(1)
     jax.clear_caches()  # of the unit before
-    if status := run_experiment(experiment, unit.command, about):
+    status = run_experiment(experiment, unit.command, about)
+    if status > 128:  # a signal; what was done is saved, and the engine runs the unit again
+        os._exit(status)
+    if status:
         raise SweepError(f"{shlex.join(unit.command)} ended with status {status}: read its report in {unit.home}")
 
 

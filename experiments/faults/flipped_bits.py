@@ -23,8 +23,8 @@ from experiments.core.runs import read_description
 from experiments.faults.damaged_files import Damage, end_of_run, telling_line
 from experiments.faults.fixtures import flip_bit
 from experiments.faults.kills import PRINTED, KillableTraining, Session
+from experiments.study.answers import load_answers
 from experiments.study.cache import read_policy
-from experiments.study.study import load_answers
 from sensors_io.errors import UserError
 from sensors_io.records import RecordStore
 from touchr1_jax.models import saved_policy

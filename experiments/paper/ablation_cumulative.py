@@ -36,8 +36,9 @@ from experiments.paper.components import BASE, BASE_ROW, COMPONENTS, published_s
 from experiments.study import paper_numbers as paper
 from experiments.study.ablation import Ablation
 from experiments.study.controls import control_sentences
+from experiments.study.seed import TrainedPolicy
 from experiments.study.stages import encode_rows, untrained
-from experiments.study.study import SFT, EvalVariant, StudyConfig, TrainedPolicy
+from experiments.study.study import SFT, EvalVariant, StudyConfig
 from touchr1_jax.training.evaluation import Evaluation
 
 UNTRAINED = "untrained"

@@ -35,8 +35,9 @@ from experiments.study.ablation import Ablation
 from experiments.study.controls import control_sentences
 from experiments.study.paper_numbers import differences_table
 from experiments.study.scores import PUBLISHED
+from experiments.study.seed import TrainedPolicy
 from experiments.study.stages import encode_rows, run_grpo, untrained
-from experiments.study.study import SFT, EvalVariant, StudyConfig, TrainedPolicy, make_study_arm
+from experiments.study.study import SFT, EvalVariant, StudyConfig, make_study_arm
 from touchr1_jax.training.evaluation import Evaluation
 
 STEPS = tuple(

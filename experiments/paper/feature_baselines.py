@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float, Int
 
 from experiments.core.errors import DataError
 from experiments.study.baselines import level_answers
+from experiments.study.seed import TrainedPolicy
 from experiments.study.stages import encode_rows
-from experiments.study.study import TrainedPolicy
 from sensors_io.records import RecordStore
 from sensors_io.schema import Sequence as Recording
 from touchr1_jax.bench.metrics import BOTTOM

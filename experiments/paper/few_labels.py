@@ -41,9 +41,11 @@ from experiments.paper.label_curves import (
     verdict,
 )
 from experiments.paper.label_free import agreed_levels, measured_levels
+from experiments.study.answers import load_answers, save_answers
 from experiments.study.dataset import Dataset
 from experiments.study.estimates import estimate
 from experiments.study.scores import score, study_settings
+from experiments.study.seed import StudySeed, supervised
 from experiments.study.stages import (
     EncodedContacts,
     GRPOArm,
@@ -58,18 +60,8 @@ from experiments.study.stages import (
     run_grpo,
     run_sft,
 )
-from experiments.study.study import (
-    SMOKE as SMOKE_STUDY,
-)
-from experiments.study.study import (
-    Study,
-    StudyConfig,
-    StudySeed,
-    load_answers,
-    open_study_data,
-    save_answers,
-    supervised,
-)
+from experiments.study.study import SMOKE as SMOKE_STUDY
+from experiments.study.study import Study, StudyConfig, open_study_data
 from experiments.study.training import DECODER, starting_model
 from sensors_io.schema import SENSORS
 from touchr1_jax.bench.metrics import Scores

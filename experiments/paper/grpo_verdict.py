@@ -27,9 +27,11 @@ from experiments.core.loops import STEPPING
 from experiments.core.results import Cell, Comparison, Estimate, Results, Table, named_table
 from experiments.core.runner import Experiment
 from experiments.core.text import bounds, interval
+from experiments.study.answers import load_answers, save_answers
 from experiments.study.dataset import Dataset
 from experiments.study.estimates import compare_over_objects, compare_over_seeds, estimate
 from experiments.study.scores import score, study_settings
+from experiments.study.seed import CONTINUED_ORDER, StudySeed, supervised
 from experiments.study.stages import (
     EncodedContacts,
     GRPOArm,
@@ -41,21 +43,8 @@ from experiments.study.stages import (
     run_decoder,
     run_grpo,
 )
-from experiments.study.study import (
-    CONTINUED,
-    CONTINUED_ORDER,
-    SFT,
-    Study,
-    StudyConfig,
-    StudySeed,
-    load_answers,
-    open_study_data,
-    save_answers,
-    supervised,
-)
-from experiments.study.study import (
-    SMOKE as SMOKE_STUDY,
-)
+from experiments.study.study import CONTINUED, SFT, Study, StudyConfig, open_study_data
+from experiments.study.study import SMOKE as SMOKE_STUDY
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS
 from touchr1_jax.bench.metrics import Scores

@@ -24,8 +24,9 @@ from experiments.core.loops import STEPPING
 from experiments.core.results import Cell, Picture, Results, Table, named_table
 from experiments.core.runner import Experiment
 from experiments.paper.presets import CURVES
+from experiments.study.seed import StudySeed, supervised
 from experiments.study.stages import encode_rows, gather_evidence, probe_features, run_decoder
-from experiments.study.study import SMOKE, StudyConfig, StudySeed, open_study_data, supervised
+from experiments.study.study import SMOKE, StudyConfig, open_study_data
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.metrics import ORDINAL
 from touchr1_jax.models.policy import Features

@@ -8,8 +8,8 @@ import jax
 from experiments.core.context import Context
 from experiments.core.results import Table, named_table
 from experiments.study.dataset import Dataset
+from experiments.study.seed import TrainedPolicy
 from experiments.study.stages import encode_rows, untrained
-from experiments.study.study import TrainedPolicy
 from experiments.study.training import TrainingConfig
 from touchr1_jax.distributed.abstract import PromptShape, abstract_grpo
 from touchr1_jax.distributed.memory import GRPOShape, counted_peak, grpo_bytes

@@ -17,7 +17,8 @@ from experiments.core.results import Cell, Table, named_table
 from experiments.core.text import interval
 from experiments.paper.feature_baselines import other_objects
 from experiments.study.estimates import RESAMPLES, pooled
-from experiments.study.study import EvalVariant, Study, TrainedPolicy
+from experiments.study.seed import TrainedPolicy
+from experiments.study.study import EvalVariant, Study
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.grounding import CONTROLS, SHUFFLE, LeastGain, least_tactile_use, tactile_use_gain
 from touchr1_jax.bench.metrics import BOTTOM, ORDINAL, Scores, keep_scored

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import tempfile
 from pathlib import Path
 
 from experiments.core import runs
@@ -10,6 +11,7 @@ from experiments.core.context import Context
 from experiments.core.text import bounds, number
 from experiments.study.dataset import Dataset
 from sensors_io.pipeline import ClipConfig
+from sensors_io.remote import Mirror, at_url
 from sensors_io.schema import Flag
 from touchr1_jax.asking import HUB, AskablePolicy, load_policy, shipped
 from touchr1_jax.bench.scoring import REPORTED
@@ -70,11 +72,17 @@ def policy_folder(context: Context, name: str, seed: int) -> Path:
 def find_policy(name: str, runs_dir: Path, weights: Path | None = None) -> AskablePolicy:
     """A policy by the folder of a run, RUN, RUN/ARM or RUN/ARM/SEED, or by what `load_policy` takes.
 
-    Of a run the policy of SFT and the first seed is taken, since every study has it.  `weights` as in `load_policy`.
+    Of a run the policy of SFT and the first seed is taken, since every study has it.  A policy may lie at a URL.
+    `weights` as in `load_policy`.
 
     Raises:
       PolicyError: there is none, or it cannot be read.
+      StoreError: the URL cannot be read.
     """
+    if at_url(name):
+        with tempfile.TemporaryDirectory() as copied:
+            Mirror(name).copy(Path(copied))
+            return AskablePolicy(load_policy(copied, weights).saved, name)
     path = Path(name)
     folder = run_policy(name, runs_dir)
     if folder is not None:
@@ -112,7 +120,13 @@ def is_policy(name: str, runs_dir: Path) -> bool:
         found = run_policy(name, runs_dir) is not None
     except PolicyError:
         return True
-    return found or name.startswith(HUB) or name in shipped() or (Path(name) / CONFIG_FILE).is_file()
+    return (
+        found
+        or name.startswith(HUB)
+        or (at_url(name) and CONFIG_FILE in Mirror(name).files())  # records may lie at a URL too
+        or name in shipped()
+        or (Path(name) / CONFIG_FILE).is_file()
+    )
 
 
 def run_policy(name: str, runs_dir: Path) -> Path | None:

@@ -6,66 +6,43 @@ and the policy itself in `policies/NAME/SEED`, so that it can be asked about new
 
 import dataclasses
 import functools
-import io
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array
 
-from experiments.core.artifacts import write_bytes
 from experiments.core.context import Context
-from experiments.study.cache import DAMAGED
 from experiments.study.dataset import Dataset
-from experiments.study.policies import policy_folder, publish_policy
+from experiments.study.parts import StudyPart, train_parts
+from experiments.study.seed import BLIND, CONTINUED, SFT, EvalVariant, SeedTraining
 from experiments.study.stages import (
-    EncodedContacts,
     GRPOArm,
     ProbeFeatures,
     StudySFT,
     Weights,
-    encode_rows,
     gather_evidence,
     make_arm,
-    noise_bank,
     probe_features,
-    run_decoder,
-    run_encoders,
-    run_grpo,
-    run_sft,
 )
 from experiments.study.training import (
     DECODER,
-    GRPO_ATTRIBUTES,
     TrainingConfig,
     open_data,
     require_derived,
     starting_model,
 )
-from sensors_io.arrays import load_arrays
 from sensors_io.scenes.config import SceneConfig
-from sensors_io.schema import ATTRIBUTES, SENSORS, UNKNOWN
-from touchr1_jax.models.policy import Features
+from sensors_io.schema import SENSORS
 from touchr1_jax.models.pretrained import load_encoder
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import ModelConfig, TouchPolicy, build_policy, check_model, with_lora
 from touchr1_jax.rewards import AnyReward, RewardError, make_rewards, uniform_prior
 from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
 from touchr1_jax.text.language import TOUCH_LANGUAGE
-from touchr1_jax.training.evaluation import Evaluation, evaluate_policy
-from touchr1_jax.training.feeds import FULL_SHARE
+from touchr1_jax.training.evaluation import Evaluation
 from touchr1_jax.training.train_encoder import EncoderTrainingConfig
 from touchr1_jax.training.train_grpo import check_rewards
-from touchr1_jax.types import Params, Parsed
-
-SFT, CONTINUED, BLIND = "sft", "sft_continued", "tactile_blind"
-"""Policies of every study besides its arms: SFT, from which arms start, the control that continues SFT for as many
-seconds as an arm takes, and SFT without touch."""
-
-CONTINUED_ORDER = 1_000
-"""Added to the seed of the questions of the control, which would otherwise be those of the phase before it."""
-
+from touchr1_jax.types import Params
 
 MODEL = ModelConfig(tactile=TactileViTConfig(sensors=0, num_layers=1, stem="statistics", stem_width=64))
 """The default policy; its stem has no parameters before its first layer, so that it is computed once."""
@@ -96,76 +73,6 @@ SMOKE = StudyConfig(
     grpo_steps=4,
 )
 """A study that takes under two minutes and learns nothing."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class StudySeed:
-    """One seed of a study; `evidence` [contact, S, A, K] is that of its verified answers."""
-
-    config: TrainingConfig
-    data: Dataset
-    policy: TouchPolicy
-    evidence: np.ndarray
-    context: Context
-    seed: int
-
-    def contacts(self, params: Params) -> EncodedContacts:
-        """The contacts that a policy's decoder is trained on, encoded by it (see `training.Recipe`)."""
-        data, paper = self.data, self.config.recipe == "paper"
-        rows = data.parts["grpo"]
-        truth = data.label[rows]
-        return EncodedContacts(
-            features=encode_rows(self.policy, params, data, rows, self.context),
-            label=np.where(np.isin(ATTRIBUTES, GRPO_ATTRIBUTES), truth, UNKNOWN) if paper else truth,
-            truth=truth,
-            noise=noise_bank(self.policy, params, data, seed=self.seed, contacts=self.config.noise_contacts),
-            evidence=self.evidence[rows],
-            **({} if paper else {"full_share": FULL_SHARE}),
-        )
-
-    def ask(self, params: Params, features: Features, *, alone: bool = True, samples: int = 0) -> Evaluation:
-        """Answers about encoded test contacts, asked under a progress bar; arguments of `evaluate_policy`."""
-        label = self.data.labels("test")
-        with self.context.progress_callback("asking") as progress:
-            order: dict[str, Any] = {"alone": alone, "samples": samples, "progress": progress}
-            return evaluate_policy(self.policy, params, features, label, **order)
-
-
-def supervised(of: StudySeed, *, tactile: Params | None = None, name: str = "", share: bool = False) -> Params:
-    """The policy of a seed before the phase of its decoder: its encoders trained by a head, then SFT end to end.
-
-    `tactile` are parameters of the tactile encoder to start from, `name` is that of the policy in its stages where a
-    run trains several with one seed; `share` as in `run_sft`.
-    """
-    config, start = of.config, {} if tactile is None else {"tactile": tactile}
-    order: dict[str, Any] = {"seed": of.seed, "share": share}
-    ending = f"{name}/{of.seed}" if name else f"{of.seed}"
-    if config.recipe == "touch" and config.encoders.steps:
-        order |= {"stage": f"encoders/{ending}", "start": start}
-        start = run_encoders(of.policy, of.data, config.encoders, of.context, **order)
-    if not config.sft.steps:
-        return start
-    order |= {"stage": f"sft/{ending}", "start": start}
-    return run_sft(of.policy, of.data, of.evidence, config.sft, of.context, **order)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class TrainedPolicy(StudySeed):
-    """A saved policy of one seed; `noise` is its encoder's noise bank, `evaluation` its answers about `test`."""
-
-    folder: Path
-    params: Params
-    test: Features
-    noise: Array
-    evaluation: Evaluation
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class EvalVariant:
-    """Another evaluation, about the test contacts, of the policy named `of`, which is SFT or an arm."""
-
-    of: str
-    evaluate: Callable[[TrainedPolicy], Evaluation]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -210,10 +117,47 @@ def run_study(
     check_model(config.model, SENSORS)
     if config.encoder is not None:
         load_encoder(config.encoder)  # a file that is no encoder is reported before data are made
+    data, policy, tactile = _opened(config, context)
+    if not context.launcher.here:
+        order = tuple((name, seed) for name in (SFT, BLIND, CONTINUED, *arms) for seed in range(config.seeds))
+        parts = [StudyPart(name=name, seed=seed, first=name in (SFT, BLIND)) for name, seed in order]
+        values = {"records": data.store.digest, "config": config, "arms": arms, "algorithms": algorithms}
+        train_parts(functools.partial(train_part, config, arms, algorithms), parts, values, config.share, context)
+    return train_study(config, data, policy, arms, context, algorithms, variants, tactile=tactile, share=config.share)
+
+
+def train_part(
+    config: StudyConfig, arms: Mapping[str, Weights], algorithms: Mapping[str, AnyAlgorithm], part: StudyPart,
+    context: Context,
+) -> None:  # fmt: skip
+    """Train one policy of one seed into the cache, where `run_study` finds it; other arguments as there."""
+    data, policy, tactile = _opened(config, context)
+    arms = {name: weights for name, weights in arms.items() if name == part.name}
+    shared = _shared(config, data, policy, arms, algorithms, probe_features(data, context), context)
+    SeedTraining(**shared, tactile=tactile, share=True, variants={}, seed=part.seed).train(part.name)
+
+
+def _opened(config: StudyConfig, context: Context) -> tuple[Dataset, TouchPolicy, Params | None]:
+    """Data, the untrained policy, and parameters of the tactile encoder that SFT starts from."""
     data = open_study_data(config, context)
     model, tactile = starting_model(config.model, config.encoder, data.clip.sensors)
-    policy = with_lora(build_policy(model, data.clip.sensors), config.lora)
-    return train_study(config, data, policy, arms, context, algorithms, variants, tactile=tactile, share=config.share)
+    return data, with_lora(build_policy(model, data.clip.sensors), config.lora), tactile
+
+
+def _shared(
+    config: TrainingConfig, data: Dataset, policy: TouchPolicy, arms: Mapping[str, Weights],
+    algorithms: Mapping[str, AnyAlgorithm], probed: ProbeFeatures, context: Context,
+) -> dict[str, Any]:  # fmt: skip
+    """Fields of all seeds."""
+    of = lambda arm: algorithms.get(arm, config.grpo.algorithm)
+    return {
+        "config": config,
+        "data": data,
+        "policy": policy,
+        "evidence": gather_evidence(data, probed, config.probe, context),
+        "context": context,
+        "arms": {a: make_study_arm(config, policy, weights, data.prior(), of(a)) for a, weights in arms.items()},
+    }
 
 
 def check_arms(
@@ -266,17 +210,12 @@ def train_study(
       share: take policies from the cache.
     """
     probed = probe_features(data, context)
-    evidence = gather_evidence(data, probed, config.probe, context)
-    prior = data.prior()
-    made = {
-        arm: make_study_arm(config, policy, weights, prior, algorithms.get(arm, config.grpo.algorithm))
-        for arm, weights in arms.items()
-    }
+    study = _shared(config, data, policy, arms, algorithms, probed, context)
+    made: Mapping[str, GRPOArm] = study["arms"]
     answers: dict[str, list[Evaluation]] = {name: [] for name in (SFT, CONTINUED, *arms, BLIND, *variants)}
-    study: dict[str, Any] = {"config": config, "data": data, "policy": policy, "context": context, "share": share}
-    study |= {"tactile": tactile, "evidence": evidence, "arms": made, "variants": variants}
+    study |= {"share": share, "tactile": tactile, "variants": variants}
     for seed in context.each("seeds", range(config.seeds)):
-        for name, evaluation in _Seed(**study, seed=seed).answers().items():
+        for name, evaluation in SeedTraining(**study, seed=seed).answers().items():
             answers[name].append(evaluation)
     further = {name: answers.pop(name) for name in variants}
     return Study(
@@ -284,7 +223,7 @@ def train_study(
         data=data,
         policy=policy,
         probed=probed,
-        prior=prior,
+        prior=data.prior(),
         arms={name: arm.weights for name, arm in made.items()},
         answers=answers,
         variants=further,
@@ -298,103 +237,3 @@ def make_study_arm(
     weights = {**weights, **config.more_rewards}
     grpo = dataclasses.replace(config.grpo, algorithm=config.algorithm(algorithm))
     return make_arm(policy, weights, prior, grpo, config.grpo_loop)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Seed(StudySeed):
-    """Its SFT checkpoint, the arms that start from it, and its blind baseline."""
-
-    tactile: Params | None
-    share: bool
-    arms: Mapping[str, GRPOArm]
-    variants: Mapping[str, EvalVariant]
-
-    def answers(self) -> dict[str, Evaluation]:
-        """Answers of all policies of this seed, from disk where they are there."""
-        names = (SFT, CONTINUED, *self.arms, BLIND, *self.variants)
-        self.context.processes.write_once(lambda: self._drop_damaged(names))
-        if not all(self._path(name).exists() for name in names):
-            self._train()
-            self._evaluate(BLIND, self._blind)
-        return {name: load_answers(self._path(name)) for name in names}
-
-    def _train(self) -> None:
-        """SFT in its phases, its control, and every arm."""
-        data, policy, context, config, seed = self.data, self.policy, self.context, self.config, self.seed
-        params = supervised(self, tactile=self.tactile, share=self.share)
-        contacts = self.contacts(params)
-        test, val = (encode_rows(policy, params, data, data.parts[part], context) for part in ("test", "val"))
-        held_out = val, data.labels("val")
-        more_sft = functools.partial(run_decoder, policy, contacts, held_out, context=context, share=self.share)
-        if config.recipe == "touch":
-            params = more_sft(config.decoder, params, seed=seed, stage=f"decoder/{SFT}/{seed}")
-        self._evaluate_all(SFT, params, test, contacts.noise)
-        stage = f"decoder/{CONTINUED}/{seed}"
-        longer = more_sft(config.continued, params, seed=seed + CONTINUED_ORDER, stage=stage)
-        self._evaluate_all(CONTINUED, longer, test, contacts.noise)
-        for name, arm in self.arms.items():
-            order: dict[str, Any] = {"seed": seed, "stage": f"grpo/{name}/{seed}", "share": self.share}
-            tuned = run_grpo(policy, arm, contacts, params, context, **order)
-            self._evaluate_all(name, tuned, test, contacts.noise)
-
-    def _blind(self) -> Evaluation:
-        order: dict[str, Any] = {"seed": self.seed, "stage": f"blind/{self.seed}", "share": self.share, "blind": True}
-        params = run_sft(self.policy, self.data, self.evidence, self.config.blind, self.context, **order)
-        features = encode_rows(self.policy, params, self.data, self.data.parts["test"], self.context, blind=True)
-        return self.ask(params, features, samples=self.config.samples)
-
-    def _evaluate_all(self, name: str, params: Params, test: Features, noise: Array) -> None:
-        """Save and evaluate a policy, then evaluate all variants of it."""
-        publish_policy(self.policy, params, self.data, name, self.seed, self.context)
-        self._evaluate(name, lambda: self.ask(params, test, samples=self.config.samples))
-        of_study = {field.name: getattr(self, field.name) for field in dataclasses.fields(StudySeed)}
-        for title, variant in self.variants.items():
-            if variant.of == name:
-                evaluation = load_answers(self._path(name))
-                made: dict[str, Any] = {"params": params, "test": test, "noise": noise, "evaluation": evaluation}
-                trained = TrainedPolicy(**of_study, **made, folder=policy_folder(self.context, name, self.seed))
-                self._evaluate(title, functools.partial(variant.evaluate, trained))
-
-    def _evaluate(self, name: str, evaluate: Callable[[], Evaluation]) -> None:
-        if not self._path(name).exists():
-            with self.context.timed(f"ask/{name}/{self.seed}"):
-                evaluation = evaluate()
-                self.context.processes.write_once(lambda: save_answers(self._path(name), evaluation))
-
-    def _drop_damaged(self, names: Sequence[str]) -> None:
-        """Remove answers that cannot be read, so that they are made again."""
-        for path in filter(Path.exists, map(self._path, names)):
-            try:
-                load_answers(path)
-            except DAMAGED as error:
-                self.context.print(f"{path} is damaged ({error}), and is made again")
-                path.unlink()
-
-    def _path(self, name: str) -> Path:
-        return self.context.directory / "answers" / f"{name}-{self.seed}.npz"
-
-
-def save_answers(path: Path, evaluation: Evaluation) -> None:
-    """Publish answers as one file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    flat: dict[str, Any] = {f: getattr(evaluation, f) for f in _FLAT if getattr(evaluation, f) is not None}
-    flat |= {f"parsed_{f}": getattr(evaluation.parsed, f) for f in _PARSED}
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **flat)
-    write_bytes(path, buffer.getvalue())
-
-
-def load_answers(path: Path) -> Evaluation:
-    """Answers that `save_answers` published.
-
-    Raises:
-      ValueError, KeyError: the file is damaged.
-    """
-    arrays = load_arrays(path)
-    flat: dict[str, Any] = {f: arrays.get(f) for f in _FLAT}
-    parsed: dict[str, Any] = {f: arrays[f"parsed_{f}"] for f in _PARSED}
-    return Evaluation(**flat, parsed=Parsed(**parsed))
-
-
-_FLAT = tuple(f.name for f in dataclasses.fields(Evaluation) if f.name != "parsed")
-_PARSED = tuple(f.name for f in dataclasses.fields(Parsed))

@@ -210,6 +210,15 @@ RUNS = {
         ),
         scaling_holds,
     ),
+    "scale_records": Shrunk(
+        lambda m: small(
+            m.SMOKE,
+            scenes=small(tiny.SCENES, objects=4, split_shares=(0.5, 0.25, 0.25)),
+            indexed=(100, 2000),
+            publications=2,
+        ),
+        lambda m, r: [row[0] for row in rows(r, 3)] == [1, 10, 100, 1000] and rows(r)[0][2:4] == [2, 2],
+    ),
     "scene_gallery": Shrunk(
         lambda m: small(
             m.SMOKE,

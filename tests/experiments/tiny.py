@@ -1,9 +1,11 @@
 """A study small enough for a test: sixteen objects, pictures of 28 px, one decoder layer, no encoder layer."""
 
 import dataclasses
+import io
 
 import jax
 import numpy as np
+from rich.console import Console
 
 from experiments.faults.trainings.small_grpo import drawn_features
 from experiments.faults.trainings.small_study import MODEL, SCENES
@@ -35,6 +37,9 @@ STUDY = StudyConfig(
     grpo_steps=2,
     samples=0,
 )
+
+
+QUIET = Console(file=io.StringIO())
 
 
 def one_batch(data: Dataset) -> TouchBatch:

@@ -1,7 +1,9 @@
 """Records at a URL are those that were pushed: through a bounded cache, over failures, and never half-written."""
 
+import errno
 import hashlib
 import pathlib
+import threading
 
 import fsspec
 import numpy as np
@@ -114,10 +116,35 @@ def failing(monkeypatch):
     return fail
 
 
-def test_failures_that_pass_change_nothing(records, failing):
+def test_failures_that_pass_change_nothing(records, failing, caplog):
     failing(3, OSError("SlowDown"))
     assert main(["push", str(records), URL]) == 0
     assert same(RecordStore(records), RecordStore(URL))
+    assert {line.partition(": ")[2] for line in caplog.messages} == {"OSError: SlowDown; trying again in 0 s"}
+
+
+def test_shards_are_copied_ahead_in_the_order_of_reading(records, monkeypatch):
+    """Of a data set that the cache holds; of another, what fits."""
+    assert main(["push", str(records), URL]) == 0
+    asked: list[str] = []
+    fetch = Mirror.fetch
+    monkeypatch.setattr(Mirror, "fetch", lambda self, name, size=None: asked.append(name) or fetch(self, name, size))
+    monkeypatch.setattr(remote, "_AHEAD", 1)
+    whole, store = ["contacts-00003.arrayrecord", "contacts-00000.arrayrecord"], RecordStore(URL)
+    for most_gb, expected in (("50", whole), ("1e-9", [])):
+        monkeypatch.setenv(remote.CACHE_GB, most_gb)
+        store = RecordStore(URL)
+        asked.clear()
+        store.fetch_ahead([6, 0, 1])
+        join()
+        assert asked == expected
+    RecordStore(records).fetch_ahead([6])  # on this machine there is nothing to copy
+
+
+def join() -> None:
+    for thread in set(threading.enumerate()) - {threading.current_thread()}:
+        if thread.name.endswith("(work)"):
+            thread.join()
 
 
 @pytest.mark.parametrize(
@@ -125,13 +152,20 @@ def test_failures_that_pass_change_nothing(records, failing):
     [
         (
             OSError("SlowDown"),
-            "OSError: SlowDown, 6 times: wait until the store answers, and run the same command again",
+            "OSError: SlowDown, 6 times: wait until the store answers and has room, and run the same command again",
+        ),
+        (
+            OSError(errno.ENOSPC, "No space left on device"),
+            "finds no room .*No space left on device.: free some space in the cache",
         ),
         (PermissionError("Forbidden"), "is refused .Forbidden.: correct the credentials"),
         (FileNotFoundError("NoSuchBucket"), "is not there .NoSuchBucket.: correct the URL, or make the bucket"),
-        (type("NoCredentialsError", (Exception,), {})("none found"), "none found: set the credentials of this store"),
+        (
+            type("NoCredentialsError", (Exception,), {})("none found"),
+            "is refused .none found.: set the credentials of this store",
+        ),
     ],
-    ids=["fails", "refuses", "bucket", "credentials"],
+    ids=["fails", "full", "refuses", "bucket", "credentials"],
 )
 def test_a_store_that_fails_is_named(records, failing, error, message):
     failing(1, error)

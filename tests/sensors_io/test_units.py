@@ -4,7 +4,9 @@ import functools
 import os
 import pathlib
 import signal
+import subprocess
 import sys
+import time
 
 import pytest
 
@@ -26,8 +28,10 @@ def write(folder: pathlib.Path, name: str, ends: str = "") -> None:
     with (folder / f"{name}.attempts").open("a") as file:
         file.write(f"{os.getpid()}\n")
     first = len((folder / f"{name}.attempts").read_text().split()) == 1
-    if first and ends == "kill":
-        os.kill(os.getpid(), signal.SIGKILL)
+    if first and ends in ("SIGKILL", "SIGTERM"):
+        os.kill(os.getpid(), signal.Signals[ends])
+    if ends == "wait":
+        time.sleep(60)
     if ends == "raise":
         raise ValueError(f"{name} cannot be made")
     (folder / f"{name}.tmp").write_text(name)
@@ -76,11 +80,46 @@ def test_every_unit_is_run_once_and_none_that_is_done(launcher, folder):
 @pytest.mark.filterwarnings("ignore")
 def test_a_killed_worker_costs_its_unit_one_more_run(launcher, folder):
     said = []
-    ended = list(finish(listed(folder, u1="kill", u4="kill"), launcher, said.append))
+    ended = list(finish(listed(folder, u1="SIGKILL", u4="SIGKILL"), launcher, said.append))
     assert sorted(unit.name for unit in ended) == [f"u{i}" for i in range(6)]
     assert attempts(folder) == {f"u{i}": 1 + (i in (1, 4)) for i in range(6)}
     assert len(said) == 2
     assert all("its worker died" in line for line in said)
+
+
+@WORKERS
+@pytest.mark.filterwarnings("ignore")
+def test_a_worker_that_is_preempted_costs_its_unit_one_more_run_at_most(launcher, folder):
+    """submitit goes on after SIGTERM, since Slurm sends it beside the signal that submitit waits for."""
+    said, goes_on = [], launcher.engine == "slurm"
+    assert len(list(finish(listed(folder, 3, u1="SIGTERM"), launcher, said.append))) == 3
+    assert attempts(folder) == {"u0": 1, "u1": 1 if goes_on else 2, "u2": 1}
+    assert [line.partition(":")[0] for line in said] == ([] if goes_on else ["u1"])
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGKILL"])
+def test_workers_end_with_their_driver(name, folder):
+    """One that was preempted leaves as by Control-C, and the same command goes on."""
+    driver = subprocess.Popen([sys.executable, "-m", __spec__.name, str(folder)], stderr=subprocess.PIPE, text=True)
+    while not (pids := attempts(folder)):
+        time.sleep(0.02)
+    driver.send_signal(signal.Signals[name])
+    said = driver.communicate()[1]
+    assert name == "SIGKILL" or said.splitlines() == ["interrupted: run the same command again to resume"]
+    assert driver.returncode == (130 if name == "SIGTERM" else -signal.SIGKILL)
+    until = time.monotonic() + 5
+    workers = [int(path.read_text()) for path in folder.glob("*.attempts")]
+    while any(map(alive, workers)):
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    assert not [name for name in pids if (folder / name).exists()]
+
+
+def alive(pid: int) -> bool:
+    try:
+        return "\nState:\tZ" not in pathlib.Path(f"/proc/{pid}/status").read_text()
+    except FileNotFoundError:
+        return False
 
 
 @WORKERS
@@ -146,3 +185,13 @@ def test_another_project_on_the_workers_is_refused_before_anything_runs(folder, 
     with pytest.raises(UnitsError, match=r"LauncherError: worker .* has numpy"):
         list(finish(listed(folder), Launcher(engine="slurm", workers=2, partition="local")))
     assert not attempts(folder)
+
+
+if __name__ == "__main__":
+    from tests.sensors_io import test_units  # workers import it by this name
+
+    try:
+        list(finish(test_units.listed(pathlib.Path(sys.argv[1]), 2, u0="wait", u1="wait"), Launcher(workers=2)))
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted: run the same command again to resume\n")
+        sys.exit(130)

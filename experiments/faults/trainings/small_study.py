@@ -76,4 +76,4 @@ def run(config: StudyConfig, context: Context) -> Results:
     )
 
 
-EXPERIMENT = Experiment(name="small_study", config=STUDY, scales={"short": SHORT}, run=run)
+EXPERIMENT = Experiment(name="small_study", config=STUDY, scales={"short": SHORT}, run=run, spreads=True)

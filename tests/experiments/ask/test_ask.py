@@ -20,8 +20,9 @@ from experiments.ask.demo import demo_server
 from experiments.ask.inputs import read_touch
 from experiments.core.errors import DataError
 from experiments.core.runs import ROOT
-from experiments.study.policies import find_policy, publish_policy
+from experiments.study.policies import find_policy, is_policy, publish_policy
 from experiments.study.stages import encode_rows
+from sensors_io.remote import CACHE
 from sensors_io.schema import SENSORS
 from tests.sensors_io.importers.films import film
 from touchr1_jax.asking import SHIPPED, TouchAnswer, TouchInput, compared, load_policy, shipped
@@ -214,6 +215,19 @@ def test_an_exported_folder_and_a_repository_of_the_hub_are_policies(runs, asked
     assert "address" in capsys.readouterr().out
     with pytest.raises(PolicyError, match="no such folder"):
         load_policy("nowhere")
+
+
+def test_an_exported_policy_may_lie_at_a_url(runs, asked, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv(CACHE, str(tmp_path / "cache"))
+    url = "memory://bucket/policy"
+    assert run_asking(["export", "trial/latest/sft/0", url, "--runs-dir", str(runs)]) == 0
+    assert "MB were sent" in capsys.readouterr().out
+    assert is_policy(url, runs)
+    assert not is_policy("memory://bucket/records:12", runs)
+    frames = {"tac3d": np.zeros((1, 28, 28, 3), np.uint8)}
+    assert find_policy(url, runs).ask(frames, "How hard?") == asked.ask(frames, "How hard?")
+    assert run_asking(["ask", "memory://bucket/none", "generated"]) == 1
+    assert len(capsys.readouterr().err.splitlines()) == 1
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """The data card on the command line, shrunk, and its commands on the same records."""
 
 import dataclasses
+from pathlib import Path
 
 import pytest
 
@@ -70,16 +71,36 @@ def test_another_author_by_command(directory, records, tmp_path):
     assert read_lines(out.with_suffix(".rejected.jsonl")) == []
 
 
-def test_anybody_is_scored(directory, tmp_path, capsys):
+def test_anybody_is_scored(directory, tmp_path, capsys, monkeypatch):
     items = read_items(directory / "items.jsonl")
-    write_lines(tmp_path / "said.jsonl", ({"id": i.ask.id, "text": i.rationale} for i in items[:-1]))
-    assert main(["score", str(directory / "items.jsonl"), str(tmp_path / "said.jsonl")]) == 0
+    said, silent = tmp_path / "said.jsonl", tmp_path / "silent.jsonl"
+    write_lines(said, ({"id": i.ask.id, "text": i.rationale} for i in items[:-1]))
+    write_lines(silent, [])
+    score = ["score", str(directory / "items.jsonl"), str(said), str(silent), "--cache-dir", str(tmp_path / "cache")]
+    assert main(score) == 0
     shown = capsys.readouterr().out
     assert f"parsed {100 * (len(items) - 1) / len(items):.1f} %" in shown
+    assert "parsed 0.0 %" in shown
     assert "no average without" in shown
-    write_lines(tmp_path / "said.jsonl", [{"id": "nobody", "text": "?"}])
-    assert main(["score", str(directory / "items.jsonl"), str(tmp_path / "said.jsonl")]) == 1
+    monkeypatch.setattr("experiments.bench.score_units.metric_rows", None)
+    assert main(score) == 0  # what was scored is not scored again
+    assert capsys.readouterr().out == shown
+    write_lines(said, [{"id": "nobody", "text": "?"}])
+    assert main(score) == 1
     assert "line 1: id is 'nobody'" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_workers_score_the_same(directory, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).resolve().parents[3]))
+    items, said = read_items(directory / "items.jsonl"), tmp_path / "said.jsonl"
+    write_lines(said, ({"id": i.ask.id, "text": i.rationale} for i in items))
+    shown = []
+    for name, options in {"here": [], "there": ["--launcher.workers", "2"]}.items():
+        score = ["score", str(directory / "items.jsonl"), str(said), "--cache-dir", str(tmp_path / name), *options]
+        assert main(score) == 0
+        shown.append(capsys.readouterr().out)
+    assert shown[0] == shown[1]
 
 
 def test_a_sample_is_drawn_by_command(directory, records, tmp_path):

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from experiments.study.scores import PUBLISHED
+from experiments.study.seed import StudySeed
 from experiments.study.stages import ProbeFeatures, StudySFT, answer_feed, gather_evidence, make_arm, run_sft
-from experiments.study.study import StudySeed, make_study_arm
+from experiments.study.study import make_study_arm
 from sensors_io.schema import LEVELS
 from tests.experiments import tiny
 from touchr1_jax.models.lora import LoraConfig, by_layer

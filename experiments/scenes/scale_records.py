@@ -1,0 +1,219 @@
+"""What do a billion generated records cost, and what limits them on 1, 10, 100 and 1,000 machines?
+
+    python -m experiments scale_records
+    python -m experiments scale_records --hourly-price 0.8 --bandwidth-gb-s 0.5      (your machines)
+
+Units are measured here: the time of a core and the bytes of a record, the requests of a shard on its way to a store and
+back, and the index of 10⁴ and 10⁷ contacts.  The page multiplies them by the counts of a billion records, which cannot
+be made here: every figure of its last two tables is simulated from measured units and from the assumed machine of the
+configuration, and says so.  The driver adopts one shard after the other, so that its time does not fall with machines.
+
+Cost: about six minutes on one core, half of it the index; `--scale smoke` one minute.
+
+Expected: some 300 hours of a core and 27 TB.  The driver waits for its disk with each shard, so that it limits first;
+larger shards move that limit.
+"""
+
+import collections
+import dataclasses
+import functools
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import fsspec
+import numpy as np
+
+from experiments.core.context import Context
+from experiments.core.results import Results, Table, at_most, named_table
+from experiments.core.runner import Experiment
+from experiments.scenes.scale_index import IndexCost, index_cost
+from experiments.scenes.throughput_rates import write_rate
+from sensors_io.generate import RECORDS_PER_SHARD
+from sensors_io.pipeline import ClipConfig, make_clip
+from sensors_io.records import RecordStore
+from sensors_io.remote import Mirror
+from sensors_io.scenes.config import SceneConfig
+from sensors_io.schema import SENSORS
+
+MOST_OPEN_S, MOST_MB, MOST_FIND_MS, MOST_GROWTH = 3.0, 500.0, 1.0, 1.5
+"""Requirements on the index: to open it, its memory, a contact by key, publishing late over publishing early."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class AssumedMachine:
+    """The machine that is assumed: nothing of it is measured."""
+
+    cores: int = 16
+    hourly_price: float = 0.5
+    """Of a machine."""
+    bandwidth_gb_s: float = 1.0
+    """To the store, of a machine."""
+    latency_ms: float = 30.0
+    """Of a request."""
+    requests_per_s: float = 3500.0
+    """Uploads that the store takes under one prefix, from all machines."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BillionConfig:
+    """Scenes that are made to measure, sizes of the indexes, and what is asked for."""
+
+    scenes: SceneConfig = SceneConfig(objects=16, sequences=64 * len(SENSORS))
+    indexed: tuple[int, int] = (10**4, 10**7)
+    publications: int = 50
+    records: int = 10**9
+    machines: tuple[int, ...] = (1, 10, 100, 1000)
+    batch: int = 64
+    """Contacts of the first batch, each in a shard of its own."""
+    machine: AssumedMachine = AssumedMachine()
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RecordUnits:
+    """Measured: milliseconds of a core and bytes of a record; requests of a shard sent and read; ms to make a clip."""
+
+    cpu_ms: float
+    bytes: float
+    sent: float
+    read: float
+    clip_ms: float
+
+
+def run(config: BillionConfig, context: Context) -> Results:
+    """Measure the units, multiply."""
+    units = RecordUnits(**context.once("units/0", functools.partial(measure_units, config, context)))
+    few, many = (
+        IndexCost(**context.once(f"index/{n}", functools.partial(_index, n, config.publications)))
+        for n in config.indexed
+    )
+    growth = many.publish_ms / few.publish_ms
+    rows = [simulated(config, units, many, machines) for machines in config.machines]
+    shards = -(-config.records // RECORDS_PER_SHARD)
+    hours = config.records * units.cpu_ms / 3.6e6
+    return Results(
+        verdict=(
+            f"Simulated: {config.records:,} records cost {hours:,.0f} hours of a core and "
+            f"{config.records * units.bytes / 1e12:.3g} TB in {shards:,} shards, "
+            f"{shards * units.sent:,.0f} requests to write and {shards * units.read:,.0f} to read all of them once.",
+            "What limits: " + ", ".join(f"{row['limit']} on {row['machines']:,}" for row in rows) + " machines.",
+        ),
+        requirements=(
+            at_most("opens", many.open_s, MOST_OPEN_S, "s", f"{many.contacts:,} contacts"),
+            at_most("memory", many.peak_mb, MOST_MB, "MB", "with a search and a split"),
+            at_most("contact by key", many.find_ms, MOST_FIND_MS, "ms"),
+            at_most("one more shard, late over early", growth, MOST_GROWTH, note="time of a core"),
+        ),
+        tables=(
+            named_table(
+                "Measured: a record", [{"unit": "here", **dataclasses.asdict(units)}], note="Requests a shard."
+            ),
+            named_table("Measured: the index", [dataclasses.asdict(one) for one in (few, many)]),
+            cost_table(config, units, many),
+            named_table(f"Simulated: {config.records:,} records", rows, note="The slowest of the four limits."),
+        ),
+        settings={"assumed machine": str(config.machine)},
+    )
+
+
+def _index(contacts: int, publications: int) -> Mapping[str, Any]:
+    with tempfile.TemporaryDirectory() as folder:
+        return dataclasses.asdict(index_cost(Path(folder), contacts, publications))
+
+
+def measure_units(config: BillionConfig, context: Context) -> Mapping[str, Any]:
+    """Make the scenes, send them to a store, read them from there; fields of `RecordUnits`."""
+    with tempfile.TemporaryDirectory() as folder:
+        out, bucket = Path(folder) / "records", f"/{Path(folder).name}"
+        with context.progress_callback("making scenes") as report:
+            rate, size = write_rate(config.scenes, out, report)
+        records = RecordStore(out)
+        shards = [name for name in records.files if name.startswith("contacts-")]
+        mirror, calls = Mirror(f"memory:/{bucket}"), collections.Counter[str]()
+        _count(mirror, calls)
+        mirror.publish(out, shards)
+        sent = calls.total() - calls["ls"]
+        calls.clear()
+        for name in shards:
+            mirror.fetch(name)
+        took = _clip_ms(records)
+        fsspec.filesystem("memory").rm(bucket, recursive=True)
+    requests = {"sent": sent / len(shards), "read": calls.total() / len(shards)}
+    return {"cpu_ms": rate.cpu_ms, "bytes": size, "clip_ms": took, **requests}
+
+
+def _count(mirror: Mirror, calls: collections.Counter[str]) -> None:
+    """Count the requests of a mirror."""
+    store = mirror._store
+
+    class Counted:
+        def __getattr__(self, name: str) -> Any:
+            calls[name] += 1
+            return getattr(store, name)
+
+    mirror._store = Counted()
+
+
+def _clip_ms(records: RecordStore) -> float:
+    """Median milliseconds to make a clip of a contact."""
+    took = []
+    for i in range(min(len(records), 16)):
+        began = time.perf_counter()
+        make_clip(records.contact(i, fields=False), records.objects[records.contacts[i].object_id], ClipConfig())
+        took.append(1e3 * (time.perf_counter() - began))
+    return float(np.median(took))
+
+
+def simulated(config: BillionConfig, units: RecordUnits, index: IndexCost, machines: int) -> dict[str, Any]:
+    """Hours to make all records on so many machines, what limits them, and a machine's time to its first batch."""
+    assumed, shards = config.machine, config.records / RECORDS_PER_SHARD
+    hours = {
+        "compute": config.records * units.cpu_ms / 3.6e6 / assumed.cores / machines,
+        "upload": config.records * units.bytes / 1e9 / assumed.bandwidth_gb_s / 3600 / machines,
+        "the driver": shards * index.published_ms / 3.6e6,
+        "requests": shards * units.sent / assumed.requests_per_s / 3600,
+    }
+    limit = max(hours, key=lambda name: hours[name])
+    contacts = config.records / len(SENSORS) / config.scenes.frame_count
+    shard_bytes, index_bytes = RECORDS_PER_SHARD * units.bytes, index.bytes * contacts / index.contacts
+    loaded_s = (config.batch * shard_bytes + index_bytes) / 1e9 / assumed.bandwidth_gb_s
+    asked_s = (config.batch * units.read + 2) * assumed.latency_ms / 1e3 / assumed.cores
+    opened_s = index.open_s * contacts / index.contacts
+    return {
+        "machines": machines,
+        "limit": limit,
+        **{f"{name}, h": value for name, value in hours.items()},
+        "wall, h": hours[limit],
+        "price": hours[limit] * machines * assumed.hourly_price,
+        "first batch, s": loaded_s + asked_s + opened_s + config.batch * units.clip_ms / 1e3 / assumed.cores,
+    }
+
+
+def cost_table(config: BillionConfig, units: RecordUnits, index: IndexCost) -> Table:
+    """Counts of all records."""
+    shards = config.records / RECORDS_PER_SHARD
+    contacts = config.records / len(SENSORS) / config.scenes.frame_count
+    figures = {
+        "hours of a core": config.records * units.cpu_ms / 3.6e6,
+        "TB": config.records * units.bytes / 1e12,
+        "contacts": contacts,
+        "shards": shards,
+        "requests to write": shards * units.sent,
+        "requests to read all once": shards * units.read,
+        "GB of the index": index.bytes * contacts / index.contacts / 1e9,
+        "s to open the index": index.open_s * contacts / index.contacts,
+        "MB of memory of a reader": index.peak_mb * contacts / index.contacts,
+    }
+    rows = [{"figure": name, "simulated": value} for name, value in figures.items()]
+    return named_table(f"Simulated: all of {config.records:,} records", rows, formats={"simulated": ",.4g"})
+
+
+SMOKE = BillionConfig(
+    scenes=SceneConfig(objects=4, sequences=8 * len(SENSORS), image_px=28, contact_grid=24),
+    indexed=(10**3, 10**5),
+    publications=5,
+)
+
+EXPERIMENT = Experiment(name="scale_records", config=BillionConfig(), scales={"smoke": SMOKE}, run=run)
