@@ -1,4 +1,4 @@
-"""What a run on released weights asks of them: that they stay the same, their memory, further evaluations."""
+"""A run on released weights: that these stay the same, the memory of its training, further evaluations."""
 
 from collections.abc import Mapping
 from pathlib import Path

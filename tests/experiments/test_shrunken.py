@@ -232,7 +232,7 @@ RUNS = {
 ELSEWHERE = {
     "ablation_ordinal", "active_touch", "dataset_card", "load_weights", "pareto", "pareto_storage", "physiclear",
     "pretrain_encoder", "real_sensors", "scene_realism", "stability_devices", "stability_faults", "stability_touch",
-    "throughput_feed", "throughput_scenes", "touch_r1",
+    "step_weights", "throughput_feed", "throughput_scenes", "touch_r1",
 }  # fmt: skip
 
 

@@ -184,7 +184,7 @@ def of_policy(adapters: Params) -> Params:
 
 
 def touch_tensors(params: Params) -> dict[str, np.ndarray]:
-    """What is neither released nor an adapter, by dotted names."""
+    """Parameters that are neither released nor adapters, by dotted names."""
     own = {name: tree for name, tree in params.items() if name not in ("vision", "decoder", ADAPTERS)}
     return {name: np.asarray(x) for name, x in traverse_util.flatten_dict(own, sep=".").items()}
 

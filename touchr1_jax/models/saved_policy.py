@@ -273,7 +273,7 @@ def format_of(folder: Path) -> str | None:
     """The `model_type` of a folder, if it has one."""
     try:
         return json.loads((folder / CONFIG_FILE).read_text(encoding="utf-8"))["model_type"]
-    except (OSError, ValueError, LookupError, TypeError):
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return None
 
 

@@ -54,6 +54,6 @@ def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransfo
     schedule = optax.warmup_cosine_decay_schedule(
         0.0, config.peak, warmup, max(steps, warmup + 1), end_value=config.peak * config.final_share
     )
-    begun = lambda count: schedule(count + 1)  # the first step of a warm-up is not spent at rate 0
+    begun = lambda count: schedule(count + (warmup > 0))  # the first step of a warm-up is not spent at rate 0
     adamw = optax.adamw(begun, b2=config.b2, weight_decay=config.weight_decay)
     return skip_nonfinite(optax.chain(optax.clip_by_global_norm(config.max_grad_norm), adamw))

@@ -57,22 +57,7 @@ def load_params(
     """
     entries = find_tensors(Path(directory))
     wanted = sources(config)
-    head, embedding = entries.get(HEAD), entries.get(EMBEDDING)
-    if config.decoder.tie_embedding and head and embedding and head.shape == embedding.shape:
-        del entries[HEAD]
-        if not np.array_equal(safetensors.read_tensor(head), safetensors.read_tensor(embedding)):
-            raise ValueError(
-                f"{head.path}: {HEAD} differs from the embedding, which config.json ties to it; set "
-                "tie_word_embeddings to false, or fetch the files again"
-            )
-    misfits = compare(entries, {s.key: s.shape for s in wanted.values()})
-    if misfits:
-        more = f"\n  … and {len(misfits) - SHOWN} more" if len(misfits) > SHOWN else ""
-        listed = "".join(f"\n  {line}" for line in misfits[:SHOWN])
-        raise ValueError(
-            f"{directory} does not hold the tensors that its config asks for:{listed}{more}\n"
-            "fetch the files again, or read them with the config.json that belongs to them"
-        )
+    require_fit(Path(directory), entries, wanted, config)
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, dtype), abstract_params(config))
     whole = jax.sharding.SingleDeviceSharding(jnp.zeros(()).device)
     places = jax.tree.map(lambda _: whole, shapes) if place is None else place(shapes)
@@ -94,6 +79,32 @@ def load_params(
         done += entries[s.key].size
         progress(done, size)
     return flax.traverse_util.unflatten_dict(loaded)
+
+
+def require_fit(
+    directory: Path, entries: dict[str, safetensors.TensorEntry], wanted: Mapping[str, Source], config: QwenConfig
+) -> None:
+    """Compare a checkpoint with its config; a tied head that is stored too is taken out of the entries.
+
+    Raises:
+      ValueError: tensors that do not fit, all of them listed, or a tied head that differs from the embedding.
+    """
+    head, embedding = entries.get(HEAD), entries.get(EMBEDDING)
+    if config.decoder.tie_embedding and head and embedding and head.shape == embedding.shape:
+        del entries[HEAD]
+        if not np.array_equal(safetensors.read_tensor(head), safetensors.read_tensor(embedding)):
+            raise ValueError(
+                f"{head.path}: {HEAD} differs from the embedding, which config.json ties to it; set "
+                "tie_word_embeddings to false, or fetch the files again"
+            )
+    misfits = compare(entries, {s.key: s.shape for s in wanted.values()})
+    if misfits:
+        more = f"\n  … and {len(misfits) - SHOWN} more" if len(misfits) > SHOWN else ""
+        listed = "".join(f"\n  {line}" for line in misfits[:SHOWN])
+        raise ValueError(
+            f"{directory} does not hold the tensors that its config asks for:{listed}{more}\n"
+            "fetch the files again, or read them with the config.json that belongs to them"
+        )
 
 
 def find_tensors(directory: Path) -> dict[str, safetensors.TensorEntry]:

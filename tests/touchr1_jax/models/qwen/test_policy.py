@@ -143,7 +143,7 @@ def test_one_grpo_step(batch):
     assert metrics["kl"] == pytest.approx(0, abs=1e-6)
     assert metrics["grounding"] > 0
     layers = by_layer(after.params["adapters"]).values()
-    assert len(layers) == len(LORA.layers)
+    assert len(layers) == len(LORA.targets)
     assert all(bool((layer.b != 0).any()) for layer in layers)
 
 
