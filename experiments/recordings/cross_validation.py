@@ -126,10 +126,7 @@ class CrossValidation:
         several = dataclasses.replace(single.shape, contacts=6)
         changes: dict[str, dict[str, Any]] = {
             "one member": {},
-            "one member, labels alone as targets": {
-                "evidence": dataclasses.replace(single.evidence, rating_share=0.0)
-            },
-            "one member, not tuned on labels": {"tune": dataclasses.replace(single.tune, steps=0)},
+            "one member, labels alone as targets": {"evidence": dataclasses.replace(single.evidence, rating_share=0.0)},
         }
         stage = lambda name: "ablation/" + name.replace(" ", "-").replace(",", "")
         found = {name: self.policy(dataclasses.replace(single, **new), stage(name)) for name, new in changes.items()}
@@ -167,7 +164,6 @@ class CrossValidation:
                 for group, kinds in GROUPS.items()
             },
             "probes of the description, no scenes": (change(families=own), auxiliary),
-            **{f"probe of {name} alone, no scenes": (change(families=(name,)), auxiliary) for name in own},
         }
         every = self.context.each("variants of the probes", variants.items())
         return {name: self.probes(*variant) for name, variant in every}

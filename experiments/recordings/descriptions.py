@@ -114,15 +114,27 @@ def read_ratings(path: Path) -> dict[str, Float[np.ndarray, "A"]]:
         raise ImportSourceError(f"{path}: {error!r}; correct the entry or remove the file") from error
 
 
-def describe_folder(folder: Path, frames: int, context: Context) -> DescribedVideos:
-    """Describe the videos of a folder without labels.
+def videos_of(places: Sequence[Path]) -> list[Path]:
+    """The videos that are named, a folder standing for those in it.
 
     Raises:
-      ImportSourceError: no such folder, no video in it, or not one that can be read.
+      ImportSourceError: no such video or folder, or a folder without a video.
     """
-    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES) if folder.is_dir() else []
-    if not files:
-        raise ImportSourceError(f"predict is {folder}: must hold videos ({', '.join(SUFFIXES)}); correct it")
+    files = []
+    for place in places:
+        inside = sorted(p for p in place.iterdir() if p.suffix.lower() in SUFFIXES) if place.is_dir() else [place]
+        if not inside or not inside[0].is_file():
+            raise ImportSourceError(f"predict is {place}: must be or hold videos ({', '.join(SUFFIXES)}); correct it")
+        files += inside
+    return files
+
+
+def describe_files(files: Sequence[Path], frames: int, context: Context) -> DescribedVideos:
+    """Describe videos without labels.
+
+    Raises:
+      ImportSourceError: not one that can be read.
+    """
     unknown = np.full((len(files), len(LANGUAGE.attributes)), -1, np.int32)
     return _describe_files(files, np.array([p.name for p in files]), unknown, frames, context)
 
@@ -168,7 +180,7 @@ def auxiliary_data(config: SceneConfig, sets: int, every: DescribedVideos, conte
 
 
 def describe_scenes(config: SceneConfig, context: Context) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Generate and describe presses as a GelSight Mini sees them; descriptions, properties and the properties' kinds."""
+    """Generate and describe presses as a GelSight Mini sees them: descriptions, properties and the kinds of these."""
 
     def make() -> dict[str, np.ndarray]:
         source = SourceConfig(scenes=config)

@@ -1,6 +1,7 @@
 """An ensemble of policies trained on described videos, its answers, and its file."""
 
 import dataclasses
+import functools
 import hashlib
 import io
 import json
@@ -45,7 +46,8 @@ class LearnConfig:
 
     Args:
       evidence: probes whose log-probabilities the encoder reads, and whose most likely levels `perceive` repeats.
-      reading, tune, reinforce: training on made-up evidence, then on the answers of real objects, then GRPO.
+      reading, tune, reinforce: training on made-up evidence, then on the answers of real objects, then GRPO.  The last
+        two have no steps by default: labels reach the policy through the evidence, and to learn from them again costs.
       members: policies of different seeds whose log-probabilities are averaged.
     """
 
@@ -53,7 +55,7 @@ class LearnConfig:
     members: int = 3
     shape: PolicyShape = PolicyShape()
     reading: TuneConfig = READING
-    tune: TuneConfig = TuneConfig()
+    tune: TuneConfig = TuneConfig(steps=0)
     reinforce: ReinforceConfig = ReinforceConfig()
 
     @property
@@ -86,10 +88,12 @@ def learn(
     """
     policy, seeds = description_policy(config.shape), [1000 * seed + m for m in range(config.members)]
     with context.timed(stage):
-        read = ProbedVideos(training, auxiliary, training, config.evidence)
-        lessons = [_lesson(config, read, training, own) for own in seeds]
-        readers = [_reader(config, 1000 + m, context) for m in range(config.members)]
-    trained = _tuned(config, config.tune, readers, lessons, seeds, context, stage)
+        trained = [_reader(config, 1000 + m, context) for m in range(config.members)]
+        lessons = list[Lesson]()
+        if config.tune.steps or config.reinforce.steps:
+            read = ProbedVideos(training, auxiliary, training, config.evidence)
+            lessons = [_lesson(config, read, training, own) for own in seeds]
+    trained = _tuned(config, config.tune, trained, lessons, seeds, context, stage)
     for m, own in enumerate(seeds if config.reinforce.steps else ()):
         with stage_hooks(context, f"grpo/{stage}/{own}", config.reinforce.steps) as hooks:
             trained[m] = reinforce(policy, config.reinforce, trained[m], lessons[m], own, hooks)
@@ -97,6 +101,7 @@ def learn(
     return TrainedEnsemble(config=config, params=params, training=training, auxiliary=auxiliary)
 
 
+@functools.lru_cache(maxsize=8)
 def _reader(config: LearnConfig, seed: int, context: Context) -> Params:
     """A policy that can read evidence and has met no object."""
     contacts = config.shape.contacts

@@ -106,7 +106,9 @@ def sense(
         wanted = [group for group in GROUPS if f"scenes, {reading}, {group}" in chosen]
         if not wanted:
             continue
-        predicted = np.mean([_predict(s, auxiliary, world, x, reading, config) for s in range(len(auxiliary.scene_x))], 0)
+        predicted = np.mean(
+            [_predict(s, auxiliary, world, x, reading, config) for s in range(len(auxiliary.scene_x))], 0
+        )
         for group in wanted:
             part = predicted[:, np.isin(auxiliary.kinds, GROUPS[group])]
             found.append(part)

@@ -41,7 +41,7 @@ LENGTH = 18
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PolicyShape:
-    """Sizes: touches of an object that a prompt holds at most, tactile tokens of each, width of the encoder, decoder."""
+    """Sizes: the most touches that a prompt holds, tactile tokens of each, width of the encoder, decoder."""
 
     contacts: int = 1
     tokens: int = 4

@@ -2,7 +2,7 @@
 
     K_ij = exp(−‖z_i − z_j‖ / median),   p = μ + k (K + λ W⁻¹)⁻¹ (Y − μ)
 
-z are standardised and clipped inputs, W the weight of each row, μ the weighted mean of the targets Y, one-hot or graded.
+z are standardised and clipped inputs, W the weight of each row, μ the weighted mean of the targets Y.
 """
 
 import collections
