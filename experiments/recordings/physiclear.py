@@ -12,8 +12,8 @@ kept learns from all labelled objects; `--predict` answers with it, in words wit
 by one, several named videos also together, as touches of one object.
 
 About 12 minutes on one core for scenes, descriptions and one partition, of which eight need 10 minutes more (`smoke`
-half a minute).  Expected: all three right of 44 % of the videos, 72 % of the levels, .32 levels off from one video, 51 %,
-77 % and .26 from all of an object; people agree with 75 to 78 % of the labels that they rated.
+half a minute).  Expected: all three right of 44 % of the videos, 72 % of the levels, .32 levels off from one video, 50 %,
+76 % and .27 from all of an object; people agree with 75 to 79 % of the labels that they rated.
 """
 
 import dataclasses
