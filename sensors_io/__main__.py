@@ -3,6 +3,7 @@
 import ast
 import difflib
 import importlib
+import os
 import pathlib
 import sys
 from collections.abc import Iterator, Mapping
@@ -11,7 +12,7 @@ from typing import Any
 import tyro
 
 from sensors_io.commands.console import ERR, OUT, complain, print_in_any_encoding
-from sensors_io.commands.numbers import require_possible
+from sensors_io.commands.values import require_possible
 from sensors_io.errors import UserError
 
 PROG = "python -m sensors_io"
@@ -23,6 +24,7 @@ COMMANDS: Mapping[str, str] = {
     "list": "list.List",
     "reindex": "reindex.Reindex",
     "push": "push.Push",
+    "export": "export.Export",
     "label": "label.Label",
     "devices": "devices.Devices",
     "view": "view.View",
@@ -34,6 +36,7 @@ COMMANDS: Mapping[str, str] = {
     "zero": "zero.Zero",
     "force-zero": "force_zero.ForceZeroing",
     "sync": "sync.Sync",
+    "ros2": "ros2.Ros2",
 }
 """Module and class of each, in `sensors_io.commands`.
 
@@ -51,6 +54,9 @@ def main(args: list[str] | None = None) -> int:
       args: the command line; None takes that of the process.
     """
     args = sys.argv[1:] if args is None else args
+    # before NumPy is loaded: its matrices are small here, and on a busy machine a second thread costs `calibrate` six
+    # times the processor time and, by another order of sums, other bits
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     print_in_any_encoding()
     if not args or args[0] in ("-h", "--help"):
         OUT.print("\n".join(usage()), markup=False, highlight=False, soft_wrap=True)

@@ -12,6 +12,9 @@ from sensors_io.remote import Place
 from sensors_io.schema import ObjectCard, SchemaError, Sequence
 from sensors_io.shards import Entries, ShardWriter
 
+RESTS = "backgrounds"
+"""Folder beside the shards with pictures of the gel at rest, which sequences name in `camera`."""
+
 _CARDS = 4096
 """Cards that stay in memory, with their views; where there are no more, they are read at once."""
 
@@ -96,6 +99,23 @@ class Cards(Mapping[str, ObjectCard]):
                 with contextlib.suppress(KeyError):  # another thread may have removed it
                     self._known.popitem(last=False)
         return card
+
+
+def rest_pictures(root: Place) -> dict[str, bytes]:
+    """Files with the gel at rest that lie beside records on this machine, by name."""
+    if not isinstance(root, pathlib.Path):
+        return {}
+    return {path.name: path.read_bytes() for path in sorted((root / RESTS).glob("*.png"))}
+
+
+def put_rest_pictures(root: pathlib.Path, files: Mapping[str, bytes]) -> None:
+    """Write such files beside records."""
+    for name, data in files.items():
+        path = root / RESTS / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_suffix(".tmp")
+        temporary.write_bytes(data)
+        temporary.replace(path)
 
 
 def _check_contact(sequences: Seq[Sequence], known: Seq[str]) -> None:

@@ -1,22 +1,19 @@
 """Generated scenes as records: a unit for each shard, resumed where it stopped, known by the hash of its config."""
 
-import collections
 import dataclasses
 import functools
 import hashlib
 import pathlib
 from collections.abc import Callable
 
-from sensors_io.contents import PartWriter
-from sensors_io.index import INDEX, Index, Part, RecordsMeta
-from sensors_io.json_files import read_json, write_json
-from sensors_io.records import RecordWriter
+from sensors_io.index import INDEX, Index, RecordsMeta
+from sensors_io.parts import make_part, part_path, write_by_units
 from sensors_io.scenes.cards import object_cards
 from sensors_io.scenes.config import SceneConfig, config_hash
 from sensors_io.scenes.protocol import contacts
 from sensors_io.schema import SENSORS
 from sensors_io.shards import shard_file
-from sensors_io.units import HERE, Launcher, WorkUnit, finish
+from sensors_io.units import HERE, Launcher, WorkUnit
 
 RECORDS_PER_SHARD = 2880
 """At the several hundred records a second of two cores, a killed generation loses some seconds."""
@@ -55,21 +52,14 @@ def generate_records(
         notes={"config": dataclasses.asdict(config)},
     )
     per_shard = max(1, records_per_shard // (len(SENSORS) * config.frame_count))
-    kept = {f"{path.name.partition('.')[0]}.arrayrecord" for path in out.glob("*.part")}
-    with RecordWriter(out, meta=meta, resume=True, kept=kept.__contains__) as writer:
-        for card in object_cards(config):
-            if card.object_id not in writer.objects_done:
-                writer.write_object(card)
-        report(writer.contacts_done, config.contact_count)
-        units = shard_units(config, out.absolute(), writer.contacts_done, writer.shards_done, per_shard)
-        waiting = collections.deque(part_path(out.absolute(), unit.name) for unit in units)
-        for stale in set(out.absolute().glob("*.part")) - set(waiting):  # adopted already, or of another division
-            stale.unlink()
-        for _ in finish(units, launcher):
-            while waiting and waiting[0].exists():  # parts are adopted in order
-                writer.adopt(Part.of(read_json(waiting[0])))
-                waiting.popleft().unlink()
-                report(writer.contacts_done, config.contact_count)
+    write_by_units(
+        out,
+        meta,
+        object_cards(config),
+        lambda contacts, shards: shard_units(config, out.absolute(), contacts, shards, per_shard),
+        launcher,
+        lambda done: report(done, config.contact_count),
+    )
 
 
 def shard_units(config: SceneConfig, out: pathlib.Path, start: int, shard: int, per_shard: int) -> list[WorkUnit]:
@@ -84,17 +74,9 @@ def shard_units(config: SceneConfig, out: pathlib.Path, start: int, shard: int, 
     return units
 
 
-def part_path(out: pathlib.Path, name: str) -> pathlib.Path:
-    """File that says that a unit's shard is in its place, and what it holds, until the index does."""
-    return out / f"{name}.part"
-
-
 def make_shard(config: SceneConfig, out: pathlib.Path, number: int, first: int, count: int, name: str) -> None:
     """Write one shard, then the part that describes it."""
-    shard = PartWriter(out, number, SENSORS)
-    for sequences in contacts(config, first, first + count):
-        shard.write(sequences)
-    write_json(part_path(out, name), dataclasses.asdict(shard.publish()))
+    make_part(out, number, SENSORS, contacts(config, first, first + count), part_path(out, name))
 
 
 def _is_complete(config: SceneConfig, out: pathlib.Path) -> bool:

@@ -16,7 +16,7 @@ import numpy as np
 
 from sensors_io.augment import AugmentConfig, apply_symmetry, draw_kept, draw_symmetry, jitter_exposure
 from sensors_io.schema import SENSORS, Clip, ContactKey, Flag, ObjectCard, SchemaError, Sequence
-from sensors_io.selection import Chooser, choose_frames, field_images, pick_frames
+from sensors_io.selection import Chooser, Shown, choose_frames, field_images, pick_frames
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -30,6 +30,7 @@ class ClipConfig:
       sensors: the streams, in order.
       rejected: a frame with one of these flags is left out where a sequence has others.
       choose: by what the frames of a stream are chosen, see `choose_frames`.
+      show: camera pictures, or fields as images (`field_images`); a sequence without pictures shows its fields anyway.
     """
 
     frames: int = 8
@@ -38,6 +39,7 @@ class ClipConfig:
     sensors: tuple[str, ...] = SENSORS
     rejected: tuple[Flag, ...] = (Flag.STRAIN_LIMIT, Flag.NOT_CONVERGED, Flag.SATURATED)
     choose: Chooser = "auto"
+    show: Shown = "pictures"
 
     def __post_init__(self) -> None:
         for name in ("frames", "image_px", "view_px"):
@@ -107,9 +109,10 @@ def make_clip(
 ) -> Clip:
     """One training example from one contact: F chosen frames of each sensor, resized, with masks for what is missing.
 
-    The whole window is stretched to the square image.  A sequence without camera frames shows its fields instead, see
-    `field_images`.  A sensor that did not see the contact has zeros and `stream_mask` False.  `frame_index` is the
-    position of a frame in its sequence.  `force_n` is zero where it was not measured: a zero vector means unknown.
+    The whole window is stretched to the square image.  A sequence without camera frames shows its fields instead, and
+    so does every sequence if the config says so, see `field_images`.  A sensor that did not see the contact has zeros
+    and `stream_mask` False.  `frame_index` is the position of a frame in its sequence.  `force_n` is zero where it was
+    not measured: a zero vector means unknown.
 
     Args:
       contact: the sequences of one contact by sensor; sensors outside `config.sensors` are ignored.
@@ -119,7 +122,8 @@ def make_clip(
       rng: source of their randomness.
 
     Raises:
-      SchemaError: the contact is empty or belongs to another object, or random changes without a source of randomness.
+      SchemaError: the contact is empty or belongs to another object, random changes without a source of randomness, or
+        fields of a sequence that has pictures alone.
     """
     if not contact:
         raise SchemaError("contact is {}: a clip needs at least one sequence; skip empty contacts")
@@ -282,7 +286,7 @@ class _Reader:
         key = self.store.contacts[i]
         card = self.store.objects[key.object_id]
         if self.felt:
-            contact = self.store.contact(i, fields=False)
+            contact = self.store.contact(i, fields=self.config.show == "fields")
             clip = make_clip(contact, card, self.config, augment=self.augment, rng=rng)
         else:
             clip = make_unfelt_clip(key, card, self.config)
@@ -320,7 +324,7 @@ def _streams(
         if sensor not in contact:
             continue
         chosen = choose_frames(contact[sensor], config.frames, config.rejected, config.choose)
-        picked = pick_frames(contact[sensor], chosen)
+        picked = _shown(pick_frames(contact[sensor], chosen), config.show)
         picked = picked if element is None else apply_symmetry(picked, element)
         images, n = _images(picked, size), len(chosen)
         by_camera = picked.frames is not None  # fields in mm know no exposure
@@ -333,6 +337,18 @@ def _streams(
         for array in (frames, force_n, index):
             array[~mask] = 0
     return {"frames": frames, "force_n": force_n, "frame_index": index, "frame_mask": mask}
+
+
+def _shown(sequence: Sequence, show: Shown) -> Sequence:
+    """The sequence without its camera frames, if fields are shown."""
+    if show == "pictures" or sequence.frames is None:
+        return sequence
+    if sequence.depth_mm is None and sequence.deformation_mm is None:
+        raise SchemaError(
+            f"{sequence.name}: has no fields, and show is 'fields': must have depth_mm or deformation_mm; write them "
+            "beside its pictures by `python -m sensors_io extract`"
+        )
+    return dataclasses.replace(sequence, frames=None)
 
 
 def _images(sequence: Sequence, size: tuple[int, int]) -> np.ndarray:

@@ -13,6 +13,9 @@ from sensors_io.schema import FRAME_ARRAYS, Flag, SchemaError, Sequence
 Chooser = Literal["auto", "force", "salience"]
 """By what frames are chosen, see `choose_frames`."""
 
+Shown = Literal["pictures", "fields"]
+"""Images of a sequence that has both."""
+
 FIELD_MM_PER_COUNT = 1.5 / 127
 """Scale of field images: count = 128 + mm / (1.5 mm / 127), so that ±1.5 mm fill the range and one count is 11.8 µm."""
 

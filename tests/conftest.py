@@ -5,6 +5,7 @@ import gc
 import os
 import tempfile
 from collections.abc import Iterator
+from pathlib import Path
 
 import hypothesis
 import jax
@@ -32,6 +33,12 @@ LEAN = (
     "--xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops,while-loop-constant-sinking"
 )
 """Flags of XLA: one piece of code for the one core of a worker, and no search for what its few rounds might share."""
+
+MOST_RESIDENT_BYTES = 2 * 2**30
+"""Above this a worker drops its programs; kept to the end they would fill 5 GB."""
+
+MOST_MAPPED = 30_000
+"""So are they above so many mapped sections, of which Linux allows a process 65,530; a program has some hundred."""
 
 MADE_BETWEEN_WALKS = 20_000
 """Objects; at Python's 700 the collector walks the traces of a file a dozen times and finds little."""
@@ -68,8 +75,22 @@ def pytest_collection_finish() -> None:
     gc.set_threshold(MADE_BETWEEN_WALKS)
 
 
+def programs_fill_memory() -> bool:
+    """True once this process holds too much memory or too many mapped sections, and on systems that do not tell."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+        mapped = Path("/proc/self/maps").read_bytes().count(b"\n")
+    except FileNotFoundError:
+        return True
+    return pages * os.sysconf("SC_PAGE_SIZE") > MOST_RESIDENT_BYTES or mapped > MOST_MAPPED
+
+
 @pytest.fixture(scope="module", autouse=True)
 def forget_programs() -> Iterator[None]:
-    """Drop the compiled programs of each file after it: files have few in common, and by the end they fill 5 GB."""
+    """Drop compiled programs after a file once they fill the memory; until then, small ones serve other files too."""
+    from touchr1_jax.training.compilation import return_memory
+
     yield
-    jax.clear_caches()
+    if programs_fill_memory():
+        jax.clear_caches()
+        return_memory()

@@ -8,6 +8,7 @@ import hashlib
 import io
 import json
 
+import h5py
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +20,8 @@ from experiments.faults.trainings.small_study import MODEL
 from sensors_io.calibration.geometry import CameraGeometry
 from sensors_io.commands import label
 from sensors_io.errors import UserError
+from sensors_io.importers.hdf5 import HDF5Config, list_hdf5
+from sensors_io.importers.hdf5_inspect import describe, propose
 from sensors_io.importers.keep import ImportSourceError, Keep
 from sensors_io.importers.octopi import list_octopi
 from sensors_io.importers.physiclear import read_labels
@@ -28,6 +31,7 @@ from sensors_io.offsets import Offsets
 from sensors_io.poses import ForceZero
 from tests.mutations import check_parser, file_of, written
 from tests.sensors_io.importers.films import film, picture
+from tests.sensors_io.importers.test_hdf5 import mapped, trial, write_map
 from tests.touchr1_jax.bench.sample_items import items
 from touchr1_jax.bench.people.audit import read_key
 from touchr1_jax.bench.people.sheets import read_sheet
@@ -43,9 +47,9 @@ from touchr1_jax.text.chat import check_template
 
 NAMES = (
     "geometry", "offsets", "force zero", "labels", "PhysiCLeAR", "Octopi", "sheet", "audit key", "picture budget",
-    "chat template", "weights' index", "encoder", "run", "policy", "picture", "video",
+    "chat template", "weights' index", "encoder", "run", "policy", "picture", "video", "HDF5 map", "HDF5",
 )  # fmt: skip
-PLAIN = ("labels", "sheet", "picture", "video")
+PLAIN = ("labels", "sheet", "picture", "video", "HDF5")
 """Those that are not JSON."""
 
 pytestmark = pytest.mark.slow
@@ -61,6 +65,30 @@ def octopi(path):
     skipped = list_octopi(path.parents[1], Keep()).skipped
     if skipped:
         raise ImportSourceError(str(skipped))
+
+
+def hdf5(folder):
+    """Readers of a mapping and of an HDF5 file, and what they read."""
+    folder.mkdir()
+    path, layout = folder / "a.h5", mapped()
+    with h5py.File(path, "w") as file:
+        trial(file.create_group("trials/0"))
+
+    def read(data_map):
+        found = list_hdf5(folder, HDF5Config(map=data_map))
+        if found.skipped:
+            raise ImportSourceError(str(found.skipped))
+        for contact in found.contacts:
+            contact.read()
+
+    def parse(data):
+        path.write_bytes(data)
+        describe(path)
+        propose(path)
+        read(write_map(folder, layout))
+
+    whole = path.read_bytes()
+    return (file_of(folder / "other.json", read), json.dumps(layout).encode()), (parse, whole)
 
 
 def encoder(path):
@@ -132,7 +160,10 @@ def files_of_people(folder):
     sheet = lambda path: read_sheet(path, "object", levels, ["mug", "pen"])
     plain = lambda tree: json.dumps(tree).encode()
     made = {name: written(folder, name, picture) for name in ("a.jpg", "a.png")}
+    layout, recordings = hdf5(folder / "hdf5")
     return {
+        "HDF5 map": (*layout, ValueError),
+        "HDF5": (*recordings, ValueError),
         "geometry": (
             file_of(folder / "geometry.json", CameraGeometry.load),
             plain(size | {"rms_mm": 0.1, "held_out_mm": 0.1}),

@@ -21,8 +21,16 @@ import cv2
 import jax
 import numpy as np
 
+from touchr1_jax.models.adapted_folder import read_saved
+from touchr1_jax.models.lora import of_decoder
 from touchr1_jax.models.policy import Features
-from touchr1_jax.models.saved_policy import PolicyError, Precision, SavedPolicy, read_policy, save_policy, words
+from touchr1_jax.models.saved_policy import (
+    PolicyError,
+    Precision,
+    SavedPolicy,
+    save_policy,
+    words,
+)
 from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.text.plain_questions import AskedAttribute, QuestionError, read_question
 from touchr1_jax.training.compilation import compiled_quickly
@@ -196,7 +204,7 @@ class AskablePolicy:
         felt = np.arange(len(contact))[:, None] < n * a
         streams = np.asarray(features.stream_mask)[contact] & felt
         batch = question_batch(policy, features, unknown, contact, attribute, streams)
-        tokens, level, share = self._decoded({"decoder": params["decoder"]}, batch)
+        tokens, level, share = self._decoded(of_decoder(params), batch)
 
         def answer(row: int, untouched: TouchAnswer | None = None) -> TouchAnswer:
             name, asked = list(self.attributes.items())[attribute[row]], int(level[row, attribute[row]])
@@ -223,12 +231,13 @@ class AskablePolicy:
         return np.asarray(greedy.tokens), np.asarray(greedy.parsed.conclude), share
 
 
-def load_policy(path: str | Path | None = None) -> AskablePolicy:
+def load_policy(path: str | Path | None = None, weights: Path | None = None) -> AskablePolicy:
     """A trained policy, ready to be asked.
 
     Args:
       path: folder of a saved policy, name of one that comes with the package, or `hub:USER/NAME` on the Hugging Face
         Hub; without one, the policy that comes with the package.
+      weights: released weights of a policy with adapters, where they are no longer where they were.
 
     Raises:
       PolicyError: there is none, or it cannot be read.
@@ -238,14 +247,14 @@ def load_policy(path: str | Path | None = None) -> AskablePolicy:
         raise PolicyError("policy is None: none comes with this version; give the folder of one, or of a run")
     name = str(path or known[0])
     if name.startswith(HUB):
-        return AskablePolicy(read_policy(fetch(name.removeprefix(HUB))), name)
+        return AskablePolicy(read_saved(fetch(name.removeprefix(HUB)), weights), name)
     folder = SHIPPED / name if name in known else Path(name)
     if not folder.exists():
         names = f"one of {', '.join(known)}, " if known else ""
         raise PolicyError(
             f"policy is {name!r}: no such folder; must be {names}the folder of a policy or {HUB}USER/NAME"
         )
-    return AskablePolicy(read_policy(folder), name)
+    return AskablePolicy(read_saved(folder, weights), name)
 
 
 def shipped() -> list[str]:
@@ -332,7 +341,7 @@ def clip_arrays(touch: TouchInput, saved: SavedPolicy) -> dict[str, np.ndarray]:
         "frame_index": np.zeros(shape, np.int32),
         "frame_mask": np.zeros(shape, bool),
         "stream_mask": np.array([sensor in touch.frames for sensor in sensors]),
-        "view": np.zeros((model.vision.image_px, model.vision.image_px, 3), np.uint8),
+        "view": np.zeros((saved.view_px, saved.view_px, 3), np.uint8),
         "view_mask": np.array(touch.view is not None),
         "label": np.full(len(saved.policy.language.attributes), -1, np.int32),
     }
@@ -347,7 +356,7 @@ def clip_arrays(touch: TouchInput, saved: SavedPolicy) -> dict[str, np.ndarray]:
         view = np.asarray(touch.view)
         if not _is_picture(view):
             raise QuestionError(f"view is {view.dtype}{list(view.shape)}: must be RGB uint8 [H, W, 3]; convert it")
-        of["view"] = _resized(view, model.vision.image_px)
+        of["view"] = _resized(view, saved.view_px)
     return of
 
 

@@ -38,6 +38,7 @@ from touchr1_jax.models.qwen.config import CONFIG_FILE
 from touchr1_jax.models.qwen.safetensors import read_header, read_tensor, write_file
 from touchr1_jax.models.qwen.weights import SINGLE
 from touchr1_jax.models.saved_policy import PolicyError
+from touchr1_jax.models.stacked import restacked, unstacked
 from touchr1_jax.rl.environment import TouchBank, TouchChoice
 from touchr1_jax.text.language import EXPLORED_ATTRIBUTES
 from touchr1_jax.types import Params
@@ -143,8 +144,8 @@ def save_explorer(folder: Path, explorer: Explorer) -> None:
     """Write a policy; one that is there is replaced, `config.json` last."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / CONFIG_FILE).unlink(missing_ok=True)
-    flat = traverse_util.flatten_dict({"policy": explorer.params}, sep="/")
-    arrays = {name: np.asarray(x, np.float32) for name, x in flat.items()} | {
+    flat = unstacked(traverse_util.flatten_dict({"policy": explorer.params}, sep="."))
+    arrays = {name.replace(".", "/"): np.asarray(x, np.float32) for name, x in flat.items()} | {
         name: np.asarray(x, np.float32) for name, x in stored(explorer.readers).items()
     }
     write_file(folder / SINGLE, arrays)
@@ -189,7 +190,8 @@ def read_explorer(folder: Path) -> Explorer:
             dataclasses.replace(DecoderConfig(**_tuples(found["decoder"])), vocab_size=0),
         )
         arrays = {name: read_tensor(entry) for name, entry in read_header(folder / SINGLE).items()}
-        tree = traverse_util.unflatten_dict(arrays, sep="/")
+        named = {name.replace("/", "."): x for name, x in arrays.items() if name.startswith("policy/")}
+        tree = traverse_util.unflatten_dict(restacked(named), sep=".")
         return Explorer(
             policy=policy,
             params=jax.tree.map(jnp.asarray, tree["policy"]),

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
+import jax.numpy as jnp
 import numpy as np
 import tyro
 
@@ -28,8 +29,10 @@ from sensors_io.errors import UserError
 from sensors_io.records import RecordStore
 from sensors_io.scenes.backend import require_backend
 from touchr1_jax.asking import HUB, AskablePolicy, push
+from touchr1_jax.models.adapted_folder import export_merged
 from touchr1_jax.models.load import WeightsError
-from touchr1_jax.models.saved_policy import Precision, save_policy
+from touchr1_jax.models.released_policy import ReleasedPolicy
+from touchr1_jax.models.saved_policy import Precision, SavedPolicy, save_policy
 from touchr1_jax.text.plain_questions import QuestionError
 from touchr1_jax.training.compilation import compilations_kept
 from touchr1_jax.training.questions import NoLabelsError
@@ -69,6 +72,8 @@ class AskCommand(Places):
     """Print JSON for programs."""
     html: Path | None = None
     """Also write a page with the frames."""
+    weights: Path | None = None
+    """Released weights of a policy with adapters, where they are no longer where they were."""
 
     def run(self) -> int:
         """Ask, print, and return the exit status."""
@@ -82,7 +87,7 @@ class AskCommand(Places):
             policy = given.pop(0)  # names neither: the error says what a policy can be
         if len(given) not in (1, 2) or (self.every and len(given) != 1):
             raise DataError(f"names are {self.names}: must be at most one POLICY and one or two INPUTs; correct them")
-        found = find_policy(policy, self.runs_dir)
+        found = find_policy(policy, self.runs_dir, self.weights)
         if self.every:
             print_lines(*self._every(found, Path(given[0])))
             return 0
@@ -124,19 +129,24 @@ class AskCommand(Places):
 class ExportCommand(Places):
     """Write a trained policy as a folder in the layout of model hubs: config, safetensors, tokenizer, model card.
 
-    The folder is a POLICY of `ask`; so is a policy of the hub, hub:USER/NAME, which this command also copies.
+    The folder is a POLICY of `ask`; so is a policy of the hub, hub:USER/NAME, which this command also copies.  A policy
+    with adapters on released weights is merged into them, in float32, as a folder of the released format.
     """
 
     policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
     folder: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER|hub:USER/NAME")]
     precision: Precision = "float32"
     """Of the parameters: int8 takes a quarter of the bytes."""
+    weights: Path | None = None
+    """Released weights of a policy with adapters, where they are no longer where they were."""
     card: Path | None = None
     """Model card to enclose; by default a table of what is known of the policy."""
 
     def run(self) -> int:
         """Write the folder and return the exit status."""
-        saved = find_policy(self.policy, self.runs_dir).saved
+        saved = find_policy(self.policy, self.runs_dir, self.weights).saved
+        if isinstance(saved.policy, ReleasedPolicy):
+            return self._merged(saved)
         figures = measured_figures(self.policy, self.runs_dir)
         saved = dataclasses.replace(saved, notes={**saved.notes, **figures})
         try:
@@ -149,6 +159,17 @@ class ExportCommand(Places):
         save_policy(Path(self.folder), saved, precision=self.precision, card=card)
         size = sum(path.stat().st_size for path in Path(self.folder).iterdir())
         print_lines(f"{self.folder}: {size / 1e6:.2f} MB")
+        return 0
+
+    def _merged(self, saved: SavedPolicy) -> int:
+        """Released weights with the adapters in them."""
+        if self.folder.startswith(HUB) or self.precision != "float32" or self.card is not None:
+            raise DataError(
+                f"folder is {self.folder!r}, precision {self.precision}: a policy with adapters is merged into a "
+                "folder in float32, without --card; leave the options out, or publish its own folder as it is"
+            )
+        kept = export_merged(Path(self.folder), saved, jnp.dtype(jnp.float32))
+        print_lines(f"{self.folder}: merged in float32, {kept:.1%} of the adapters' change kept")
         return 0
 
 

@@ -73,10 +73,10 @@ def read_touch(source: str | Path, saved: SavedPolicy, sensor: str = "") -> Aske
     path, _, which = (text, "", "") if Path(text).exists() else text.rpartition(":")
     if (Path(path) / INDEX).exists():
         return _recorded(Path(path), which, saved)
-    if not path or not Path(path).exists():
+    if not path or not (Path(path).is_file() or Path(path).is_dir()):
         raise DataError(
-            f"input is {text!r}: no such file; must be a folder of records (RECORDS:CONTACT), a video, a folder of "
-            f"pictures, or {GENERATED}"
+            f"input is {text!r}: no such file or folder; must be a folder of records (RECORDS:CONTACT), a video, "
+            f"a folder of pictures, or {GENERATED}"
         )
     return _filmed(Path(path), saved, sensor)
 
@@ -141,7 +141,7 @@ def contact_row(store: RecordStore, which: str) -> int:
 def _of_contact(store: RecordStore | LiveScenes, i: int, saved: SavedPolicy, name: str) -> AskedTouch:
     """A contact with its object's card."""
     card = store.objects[store.contacts[i].object_id]
-    return _asked(store.contact(i, fields=False), card, saved, name)
+    return _asked(store.contact(i, fields=saved.reads.show == "fields"), card, saved, name)
 
 
 def _filmed(path: Path, saved: SavedPolicy, sensor: str) -> AskedTouch:

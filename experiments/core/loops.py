@@ -14,10 +14,6 @@ from touchr1_jax.training.loop import SKIPPED, Batches, Hooks, Log, LoopConfig, 
 STEPPING, WAITING = "in steps", "waiting for data"
 """Names in `timing` of the steps after the first and of their waiting for a batch, each followed by `/STAGE`."""
 
-KEPT = "kept"
-"""Stages whose result is the share of a stage's adapters that its merged weights keep (see `lora.kept_share`)."""
-
-
 COMPILING = "compiling the first step"
 """Note beside the bar of a stage until its first step is done."""
 
@@ -73,7 +69,6 @@ def stage_hooks(
             checkpoints=checkpoints,
             resumed=resumed,
             stopping=stopping,
-            merged=lambda kept: context.save_stage(f"{KEPT}/{stage}", kept),
             times=times,
             devices=context.devices,
             sampled=None if describe is None else lambda t, sample: context.sampled(stage, t, describe(sample)),

@@ -21,7 +21,7 @@ from experiments.engine.speed import Workload
 from touchr1_jax.distributed.memory import Compiled, GRPOShape, counted_peak, grpo_bytes, reserved_bytes
 from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.distributed.work import grpo_work, model_flops
-from touchr1_jax.models.lm import LayerCache, attend_causally
+from touchr1_jax.models.blocked_attention import LayerCache, attend_causally
 from touchr1_jax.models.qwen.config import QwenVisionConfig
 from touchr1_jax.models.qwen.geometry import Grid
 from touchr1_jax.models.qwen.vision import QwenVision

@@ -128,6 +128,8 @@ def run(config: ParetoGrpoConfig, context: Context) -> Results:
         key: LearningCurves(rewards=rewards[key], step_s=float(np.median(s)))
         for key, s in zip(last, seconds, strict=True)
     }
+    del last, calls
+    jax.clear_caches()  # the mapped sections of so many programs reach Linux's limit (65,530) with those of the options
     options = {}
     if config.options:
         options = measure_options(config.options, config.effort, config.option_seeds, config.timed, context)

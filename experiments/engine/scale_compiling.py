@@ -79,11 +79,6 @@ class Training:
         step = self.step(setup)
         return grpo_bytes(self.shape(setup), step.state, step.batch, step.frozen, step.base)
 
-    def of_depth(self, layers: int) -> "Training":
-        """The same training with another number of layers."""
-        decoder = dataclasses.replace(self.model.decoder, num_layers=layers)
-        return dataclasses.replace(self, model=dataclasses.replace(self.model, decoder=decoder))
-
 
 def score_of(streams: int):
     """A reward of the right form for a step that is compiled and never run."""

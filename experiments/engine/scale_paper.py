@@ -4,11 +4,11 @@
 
 Touch-R1 trained Qwen2.5-VL 7B on sixteen H200 with 8 frames of 448² from four sensors and groups of eight.  Here the
 same step, with the reference and the counterfactual policy, is compiled for sixteen devices without weights and without
-the devices, and the memory that the compiler reserves is compared with a count by hand.  Decoders of one and two layers
-are compiled at full width; a straight line gives all layers.  `--compiler cpu` is the compiler of this machine;
-`--compiler h200` is the GPU's, which needs JAX's CUDA plugin but no GPU.  Other meshes, and adapters on a frozen base,
-are counted; `--compiled N` compiles more of them.  To train in this layout give a study `--distributed --mesh.fsdp 8
---mesh.tensor 2`, in one process per GPU under Slurm, with `grpo.remat`, `grpo.bfloat16` and one prompt a micro-batch.
+the devices, and the memory that the compiler reserves is compared with a count by hand.  `--compiler cpu` is the
+compiler of this machine; `--compiler h200` is the GPU's, which needs JAX's CUDA plugin but no GPU.  Other meshes, and
+adapters on a frozen base, are counted; `--compiled N` compiles more of them.  To train in this layout give a study
+`--distributed --mesh.fsdp 8 --mesh.tensor 2`, in one process per GPU under Slurm, with `grpo.remat`, `grpo.bfloat16`
+and one prompt a micro-batch.
 
 Cost: 5 to 10 minutes on one core with one mesh compiled; `--scale smoke` half a minute.
 
@@ -32,7 +32,7 @@ from experiments.engine.scale_compiling import (
     Training,
     compile_in_process,
 )
-from touchr1_jax.distributed.memory import ARGUMENTS, LEARNING, SAMPLING, Compiled, at_depths, counted_peak
+from touchr1_jax.distributed.memory import ARGUMENTS, LEARNING, SAMPLING, Compiled, counted_peak
 from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.distributed.work import Machine, model_flops, seconds
 from touchr1_jax.models.lora import LoraConfig
@@ -42,10 +42,9 @@ GB = 1e9
 
 Lines = Mapping[Setup, Mapping[str, int]]  # setup → line → counted bytes on each device
 
-Reserved = Mapping[Setup, Mapping[int, Compiled]]
-"""Setup → layers → bytes that the compiler reserves; the largest number of layers is extrapolated."""
+Reserved = Mapping[Setup, Compiled]
+"""Bytes that the compiler reserves for each setup that was compiled."""
 
-LAYERS = (1, 2)  # depths that are compiled
 COUNTERS_BYTES = 12  # bytes of the step's arguments that no line counts: its key, 8, and its number, 4
 
 
@@ -126,26 +125,23 @@ def run(config: ScaleConfig, context: Context) -> Results:
     )
 
 
-def compiled(config: ScaleConfig, setup: Setup, context: Context) -> dict[int, Compiled]:
-    """Bytes that the compiler reserves at both depths, saved as stages, and by extrapolation at the model's depth."""
-    found: dict[int, Compiled] = {}
-    for layers in context.each(setup.name, LAYERS):
-        stage = f"compile/{config.setups.index(setup)}/{layers}"
-        if not context.done(stage):
-            with context.timed(stage):
-                reserved = compile_in_process(config.training.of_depth(layers), setup, config.compiler)
-            context.save_stage(stage, reserved)
-        found[layers] = Compiled(*context.load_stage(stage))
-        context.print(f"{setup.name}, {layers} layers: {found[layers].peak / GB:.2f} GB")
-    return found | {config.depth: at_depths(found, config.depth)}
+def compiled(config: ScaleConfig, setup: Setup, context: Context) -> Compiled:
+    """Bytes that the compiler reserves, saved as a stage."""
+    stage = f"compile/{config.setups.index(setup)}"
+    if not context.done(stage):
+        with context.timed(stage):
+            reserved = compile_in_process(config.training, setup, config.compiler)
+        context.save_stage(stage, reserved)
+    found = Compiled(*context.load_stage(stage))
+    context.print(f"{setup.name}: {found.peak / GB:.2f} GB")
+    return found
 
 
 def requirements(config: ScaleConfig, lines: Lines, reserved: Reserved) -> tuple[Requirement, ...]:
     """The count and the reserved memory fit the device; the compiled arguments equal the counted ones."""
     bound = config.machine.memory_bytes / GB
     found = [at_most(f"{setup.name}: counted", counted_peak(by) / GB, bound, "GB") for setup, by in lines.items()]
-    for setup, depths in reserved.items():
-        full = depths[config.depth]
+    for setup, full in reserved.items():
         own = sum(lines[setup][name] for name in ARGUMENTS) + COUNTERS_BYTES
         found.append(at_most(f"{setup.name}: reserved for {config.compiler}", full.peak / GB, bound, "GB"))
         found.append(at_most(f"{setup.name}: arguments off the count", abs(full.arguments / own - 1), 1e-3))
@@ -160,9 +156,9 @@ def verdict(config: ScaleConfig, lines: Lines, reserved: Reserved) -> tuple[str,
         f"Counted by hand, a step of the {config.size} on {first.mesh.devices} devices ({first.name}) takes "
         f"{counted_peak(lines[first]) / GB:.1f} of {config.machine.memory_bytes / GB:.0f} GB on each.",
         *(
-            f"XLA reserves {by[config.depth].peak / GB:.1f} GB for {setup.name} (compiler: {config.compiler}), the "
+            f"XLA reserves {c.peak / GB:.1f} GB for {setup.name} (compiler: {config.compiler}), the "
             "reference and the counterfactual passes included."
-            for setup, by in reserved.items()
+            for setup, c in reserved.items()
         ),
         f"Predicted, not measured: {sum(times.values()):.1f} s a step, of which sampling {times['sampling']:.1f} s.",
     )
@@ -186,23 +182,21 @@ def byte_table(lines: Lines) -> Table:
 def memory_table(config: ScaleConfig, lines: Lines, reserved: Reserved) -> Table:
     """The compiler's figures with the count."""
     rows: list[dict[str, Cell]] = []
-    for setup, by in reserved.items():
-        for layers, c in by.items():
-            full = layers == config.depth
-            rows.append(
-                {
-                    "setup": f"{setup.name}, {layers} layers{' (extrapolated)' if full else ''}",
-                    "arguments": c.arguments / GB,
-                    "temporary": c.temporary / GB,
-                    "peak": c.peak / GB,
-                    "counted": counted_peak(lines[setup]) / GB if full else None,
-                }
-            )
+    for setup, c in reserved.items():
+        rows.append(
+            {
+                "setup": f"{setup.name}, {config.depth} layers",
+                "arguments": c.arguments / GB,
+                "temporary": c.temporary / GB,
+                "peak": c.peak / GB,
+                "counted": counted_peak(lines[setup]) / GB,
+            }
+        )
     return named_table(
         f"Reserved by XLA's compiler for {config.compiler}, GB on each device",
         rows,
         formats=dict.fromkeys(("arguments", "temporary", "peak", "counted"), ".2f"),
-        note="Equal layers need equal memory: a straight line through the compiled depths gives the model's.",
+        note="On `cpu` the compiler multiplies bfloat16 as float32, layer by layer: an upper bound.",
     )
 
 
@@ -235,8 +229,8 @@ def memory_bars(lines: Lines, reserved: Reserved, bound: float) -> bytes:
     rows = [setup.name for setup in lines]
     bars = [Series(name, x=sizes, bar=True) for name, sizes in parts(lines).items()]
     if reserved:
-        peaks, y = [by[max(by)].peak / GB for by in reserved.values()], [rows.index(s.name) for s in reserved]
-        bars.append(Series("compiled, extrapolated", x=peaks, y=y, marker="D", colour="black"))
+        peaks, y = [c.peak / GB for c in reserved.values()], [rows.index(s.name) for s in reserved]
+        bars.append(Series("compiled", x=peaks, y=y, marker="D", colour="black"))
     rules = [Rule(x=bound / GB, name="memory of the device")]
     return draw([Panel(bars, rows=rows, stacked=True, x_label="GB on each device", rules=rules)])
 

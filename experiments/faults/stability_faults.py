@@ -53,7 +53,7 @@ from experiments.study import stages
 from experiments.study.scores import PUBLISHED
 from experiments.study.study import StudyConfig, open_study_data
 from sensors_io.scenes.config import SceneConfig
-from touchr1_jax.models.touch_policy import build_policy
+from touchr1_jax.models.touch_policy import build_policy, with_lora
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.pretraining import PretrainConfig
 
@@ -232,7 +232,7 @@ def waits(config: WaitingConfig, context: Context) -> Waits:
     study, loop = config.study, LoopConfig(steps=config.steps, save_every=config.steps)
     sft, grpo, blind, dynamics = names = ("sft/0", "grpo/published/0", "blind/0", "dynamics/0")
     data = open_study_data(study, context)
-    policy = build_policy(study.model, data.clip.sensors)
+    policy = with_lora(build_policy(study.model, data.clip.sensors), study.lora)
     evidence = stages.gather_evidence(data, stages.probe_features(data, context), study.probe, context)
     sft_config = dataclasses.replace(study.sft, steps=config.steps, save_every=config.steps)
     params = stages.run_sft(policy, data, evidence, sft_config, context, seed=0, stage=sft)

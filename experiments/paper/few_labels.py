@@ -75,7 +75,7 @@ from sensors_io.schema import SENSORS
 from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.tactile_vit import TactileViTConfig
-from touchr1_jax.models.touch_policy import TouchPolicy, build_policy, check_model
+from touchr1_jax.models.touch_policy import TouchPolicy, build_policy, check_model, with_lora
 from touchr1_jax.rewards import uniform_prior
 from touchr1_jax.rl.config import GRPOConfig, Norm, Rloo
 from touchr1_jax.training.evaluation import Evaluation, evaluate_policy
@@ -240,7 +240,7 @@ def run(config: FewLabelsConfig, context: Context) -> Results:
     train = data.training
     path = pretrained_encoder(config, data, train, context)
     model, tactile = starting_model(config.model, path, data.clip.sensors)
-    policy, probed = build_policy(model, data.clip.sensors), probe_features(data, context)
+    policy, probed = with_lora(build_policy(model, data.clip.sensors), config.lora), probe_features(data, context)
     levels = np.array(context.once("measured", lambda: measured_levels(data.store, train).tolist()))
     answers: dict[str, list[Evaluation]] = {}
     for seed in context.each("seeds", range(config.seeds)):

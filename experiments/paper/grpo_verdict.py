@@ -60,7 +60,7 @@ from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS
 from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.models.policy import Features
-from touchr1_jax.models.touch_policy import TouchPolicy, build_policy, check_model
+from touchr1_jax.models.touch_policy import TouchPolicy, build_policy, check_model, with_lora
 from touchr1_jax.rl.config import AnyAlgorithm, Cispo, Dapo, GRPOConfig, Gspo, Norm, Rloo
 from touchr1_jax.training.evaluation import Evaluation, evaluate_policy
 from touchr1_jax.training.loop import LoopConfig
@@ -122,7 +122,7 @@ def run(config: GrpoVerdictConfig, context: Context) -> Results:
     fresh = data
     if config.data == "generated":
         fresh = open_study_data(dataclasses.replace(config, scenes=config.fresh), context)
-    policy = build_policy(config.model, data.clip.sensors)
+    policy = with_lora(build_policy(config.model, data.clip.sensors), config.lora)
     probed = probe_features(data, context)
     study = Study(config=config, data=fresh, policy=policy, probed=probed, prior=data.prior(), arms={}, answers={})
     evidence = gather_evidence(data, probed, config.probe, context)

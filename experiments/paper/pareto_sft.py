@@ -29,7 +29,7 @@ from experiments.study.study import SMOKE, StudyConfig, StudySeed, open_study_da
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.metrics import ORDINAL
 from touchr1_jax.models.policy import Features
-from touchr1_jax.models.touch_policy import build_policy
+from touchr1_jax.models.touch_policy import build_policy, with_lora
 from touchr1_jax.training.evaluation import evaluate_policy
 from touchr1_jax.types import Params
 
@@ -69,7 +69,7 @@ def run(config: ParetoSFTConfig, context: Context) -> Results:
     """Train every combination of lengths, score it on validation objects."""
     study = config.study
     data = open_study_data(study, context)
-    policy = build_policy(study.model, data.clip.sensors)
+    policy = with_lora(build_policy(study.model, data.clip.sensors), study.lora)
     evidence = gather_evidence(data, probe_features(data, context), study.probe, context)
     scores: dict[Lengths, list[Mapping[str, float]]] = {}
     for number in context.each("seeds", range(study.seeds)):

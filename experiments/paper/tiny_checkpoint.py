@@ -20,7 +20,6 @@ import tokenizers
 from tokenizers import decoders, models, pre_tokenizers, trainers
 
 from experiments.core.context import Context
-from experiments.paper.released_policy import ReleasedModel, ReleasedPolicy, build_released_policy, plain_answers
 from sensors_io.schema import SENSORS
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.load import TOKENIZER_FILE, load_checkpoint
@@ -28,6 +27,7 @@ from touchr1_jax.models.qwen.config import CONFIG_FILE, QwenConfig, QwenVisionCo
 from touchr1_jax.models.qwen.model import init_params
 from touchr1_jax.models.qwen.pictures import PREPROCESSOR_FILE
 from touchr1_jax.models.qwen.weights import SINGLE, save_params
+from touchr1_jax.models.released_policy import ReleasedModel, ReleasedPolicy, build_released_policy, plain_answers
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import touch_shapes
 from touchr1_jax.text.chat import MARKS, SYSTEM

@@ -1,5 +1,7 @@
 """The trained policies of a run, `policies/NAME/SEED`: published by studies, found again by name."""
 
+import dataclasses
+import os
 from pathlib import Path
 
 from experiments.core import runs
@@ -11,9 +13,12 @@ from sensors_io.pipeline import ClipConfig
 from sensors_io.schema import Flag
 from touchr1_jax.asking import HUB, AskablePolicy, load_policy, shipped
 from touchr1_jax.bench.scoring import REPORTED
+from touchr1_jax.models.adapted_folder import save_adapted
+from touchr1_jax.models.lora import exported
 from touchr1_jax.models.qwen.config import CONFIG_FILE
+from touchr1_jax.models.released_policy import ReleasedPolicy
 from touchr1_jax.models.saved_policy import PolicyError, PolicyInput, SavedPolicy, save_policy
-from touchr1_jax.models.touch_policy import ModelConfig, TouchPolicy
+from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.types import Params
 
 FIGURES = ("acc", "h_acc", "r_acc", "p_acc", "mat_acc", "omae", "parse_rate")
@@ -30,13 +35,12 @@ ONLY_SCENES = "generated scenes only: pictures of real sensors look different, a
 
 
 def publish_policy(policy: TouchPolicy, params: Params, data: Dataset, name: str, seed: int, context: Context) -> None:
-    """Save a policy in its run; released models have a format of their own, in which `touch_r1` writes them."""
-    if not isinstance(policy.model, ModelConfig):
-        return
+    """Save a policy in its run; of one on released weights the adapters, and where the weights are."""
     summary, meta = data.summary(), data.store.meta
     reads = PolicyInput(
         rejected=tuple(str(flag.name) for flag in data.clip.rejected),
         choose=data.clip.choose,
+        show=data.clip.show,
         force=data.has_force,
         view=any(card.view is not None for card in data.store.objects.values()),
     )
@@ -47,14 +51,26 @@ def publish_policy(policy: TouchPolicy, params: Params, data: Dataset, name: str
         SCENES: meta.notes.get("config", {}),
     } | ({"limits": ONLY_SCENES} if meta.source == "generated" else {})
     saved = SavedPolicy(policy=policy, params=params, reads=reads, notes=jsonable(notes))
-    folder = context.directory / POLICIES / name / str(seed)
-    context.processes.write_once(lambda: save_policy(folder, saved))
+    folder = policy_folder(context, name, seed)
+    if not isinstance(policy, ReleasedPolicy):
+        merged = dataclasses.replace(saved, params=exported(params, policy.fns.lora))
+        context.processes.write_once(lambda: save_policy(folder, merged))
+        return
+    weights = policy.checkpoint.directory.resolve()
+    inside = weights.is_relative_to(context.directory.resolve())  # then the run can be moved as a whole
+    place = os.path.relpath(weights, folder.resolve()) if inside else str(weights)
+    context.processes.write_once(lambda: save_adapted(folder, saved, place))
 
 
-def find_policy(name: str, runs_dir: Path) -> AskablePolicy:
+def policy_folder(context: Context, name: str, seed: int) -> Path:
+    """Where a run keeps a policy."""
+    return context.directory / POLICIES / name / str(seed)
+
+
+def find_policy(name: str, runs_dir: Path, weights: Path | None = None) -> AskablePolicy:
     """A policy by the folder of a run, RUN, RUN/ARM or RUN/ARM/SEED, or by what `load_policy` takes.
 
-    Of a run the policy of SFT and the first seed is taken, since every study has it.
+    Of a run the policy of SFT and the first seed is taken, since every study has it.  `weights` as in `load_policy`.
 
     Raises:
       PolicyError: there is none, or it cannot be read.
@@ -62,9 +78,9 @@ def find_policy(name: str, runs_dir: Path) -> AskablePolicy:
     path = Path(name)
     folder = run_policy(name, runs_dir)
     if folder is not None:
-        return load_policy(folder)
+        return load_policy(folder, weights)
     if not name or name.startswith(HUB) or path.exists() or name in shipped():
-        return load_policy(name or None)
+        return load_policy(name or None, weights)
     raise PolicyError(
         f"policy is {name!r}: must be a run, RUN/ARM or RUN/ARM/SEED under {runs_dir}, a policy's folder, "
         f"{HUB}USER/NAME, or one of {', '.join(shipped()) or 'those that come with the package (none)'}"
@@ -136,8 +152,9 @@ def clip_of(saved: SavedPolicy) -> ClipConfig:
     return ClipConfig(
         frames=saved.model.frames,
         image_px=saved.model.image_px,
-        view_px=saved.model.vision.image_px,
+        view_px=saved.view_px,
         sensors=saved.sensors,
         rejected=tuple(Flag[name] for name in saved.reads.rejected),
         choose=saved.reads.choose,  # type: ignore[arg-type]
+        show=saved.reads.show,  # type: ignore[arg-type]
     )

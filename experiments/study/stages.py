@@ -21,7 +21,6 @@ from experiments.study.cache import cached
 from experiments.study.dataset import Dataset
 from sensors_io.augment import AugmentConfig
 from sensors_io.schema import ATTRIBUTES, LEVELS
-from touchr1_jax.models.lora import LoraConfig
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.rewards import make_rewards
@@ -133,7 +132,7 @@ def run_sft(
     if not share:
         return train()
     values = {"records": data.store.digest, "config": config, "model": policy.model, "clip": data.clip}
-    values |= {"seed": seed, "blind": blind, "mesh": context.devices.shape}
+    values |= {"seed": seed, "blind": blind, "mesh": context.devices.shape, "lora": policy.fns.lora}
     arrays = {"evidence": evidence, "rows": data.parts["sft"], "start": start or {}}
     return cached("sft", values, arrays, train, context, stage)
 
@@ -248,8 +247,7 @@ class GRPOArm:
     """One arm of a study: its reward, its algorithm, its length.
 
     `score` is the total reward, made of the weights and of the prior, the share of each level among the training
-    labels; it is one object for all seeds, so that it is compiled once.  Without `lora` the decoder's weights are
-    trained, not adapters.
+    labels; it is one object for all seeds, so that it is compiled once.
     """
 
     weights: Weights
@@ -257,7 +255,6 @@ class GRPOArm:
     score: ScoreFn
     config: GRPOConfig
     loop: LoopConfig
-    lora: LoraConfig | None = None
 
 
 def make_arm(
@@ -266,12 +263,11 @@ def make_arm(
     prior: Float[np.ndarray, "A K"],
     config: GRPOConfig,
     loop: LoopConfig,
-    lora: LoraConfig | None = None,
 ) -> GRPOArm:
     """An arm whose total reward is made of its weights, in the form that its algorithm asks for, and the prior."""
     weights = reward_weights(config.algorithm, weights)
     score = make_score(policy.parser, make_rewards(prior), weights, policy.tokenizer.decode)
-    return GRPOArm(weights=weights, prior=prior, score=score, config=config, loop=loop, lora=lora)
+    return GRPOArm(weights=weights, prior=prior, score=score, config=config, loop=loop)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -333,6 +329,7 @@ def run_decoder(
     if not share:
         return train()
     values = {"config": config, "model": policy.model, "seed": seed, "mesh": context.devices.shape}
+    values |= {"lora": policy.fns.lora}
     inputs = {**dataclasses.asdict(contacts.features), "truth": contacts.truth, "evidence": contacts.evidence}
     held = {**dataclasses.asdict(validation[0]), "label": validation[1]}
     arrays = {**params, "input": inputs, "validation": held}
@@ -364,7 +361,7 @@ def run_grpo(
     share: bool = False,
 ) -> Params:
     """GRPO of an SFT policy's decoder with an arm's reward; alarms are logged and printed; `share` as in `run_sft`."""
-    config, loop, lora = arm.config, arm.loop, arm.lora
+    config, loop = arm.config, arm.loop
 
     def train() -> Params:
         order: dict[str, Any] = {"batch_size": config.drawn, "seed": seed}
@@ -374,11 +371,11 @@ def run_grpo(
         feed, noise = QuestionFeed(policy, contacts.features, contacts.label, **order), contacts.noise
         describe = functools.partial(describe_sample, policy)
         with stage_hooks(context, stage, loop.steps, make_log=alarm_log, describe=describe) as hooks:
-            return train_grpo(policy, params, feed, arm.score, config, loop, hooks, noise=noise, lora=lora, seed=seed)
+            return train_grpo(policy, params, feed, arm.score, config, loop, hooks, noise=noise, seed=seed)
 
     if not share:
         return train()
-    values = {"weights": list(arm.weights.items()), "config": config, "steps": loop.steps, "lora": lora}
+    values = {"weights": list(arm.weights.items()), "config": config, "steps": loop.steps, "lora": policy.fns.lora}
     values |= {"model": policy.model, "seed": seed, "mesh": context.devices.shape}
     inputs = {**dataclasses.asdict(contacts.features), "noise": contacts.noise, "prior": arm.prior}
     inputs |= {"label": contacts.label, "truth": contacts.truth, "evidence": contacts.evidence}

@@ -18,7 +18,7 @@ from experiments.core.artifacts import write_bytes
 from experiments.core.context import Context
 from experiments.study.cache import DAMAGED
 from experiments.study.dataset import Dataset
-from experiments.study.policies import publish_policy
+from experiments.study.policies import policy_folder, publish_policy
 from experiments.study.stages import (
     EncodedContacts,
     GRPOArm,
@@ -49,7 +49,7 @@ from sensors_io.schema import ATTRIBUTES, SENSORS, UNKNOWN
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.pretrained import load_encoder
 from touchr1_jax.models.tactile_vit import TactileViTConfig
-from touchr1_jax.models.touch_policy import ModelConfig, TouchPolicy, build_policy, check_model
+from touchr1_jax.models.touch_policy import ModelConfig, TouchPolicy, build_policy, check_model, with_lora
 from touchr1_jax.rewards import AnyReward, RewardError, make_rewards, uniform_prior
 from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
 from touchr1_jax.text.language import TOUCH_LANGUAGE
@@ -151,8 +151,9 @@ def supervised(of: StudySeed, *, tactile: Params | None = None, name: str = "", 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TrainedPolicy(StudySeed):
-    """A trained policy of one seed; `noise` is its encoder's noise bank, `evaluation` its answers about `test`."""
+    """A saved policy of one seed; `noise` is its encoder's noise bank, `evaluation` its answers about `test`."""
 
+    folder: Path
     params: Params
     test: Features
     noise: Array
@@ -211,7 +212,7 @@ def run_study(
         load_encoder(config.encoder)  # a file that is no encoder is reported before data are made
     data = open_study_data(config, context)
     model, tactile = starting_model(config.model, config.encoder, data.clip.sensors)
-    policy = build_policy(model, data.clip.sensors)
+    policy = with_lora(build_policy(model, data.clip.sensors), config.lora)
     return train_study(config, data, policy, arms, context, algorithms, variants, tactile=tactile, share=config.share)
 
 
@@ -293,10 +294,10 @@ def train_study(
 def make_study_arm(
     config: TrainingConfig, policy: TouchPolicy, weights: Weights, prior: np.ndarray, algorithm: AnyAlgorithm
 ) -> GRPOArm:
-    """An arm with a study's steps, adapters and further rewards."""
+    """An arm with a study's steps and further rewards."""
     weights = {**weights, **config.more_rewards}
     grpo = dataclasses.replace(config.grpo, algorithm=config.algorithm(algorithm))
-    return make_arm(policy, weights, prior, grpo, config.grpo_loop, config.grpo_lora)
+    return make_arm(policy, weights, prior, grpo, config.grpo_loop)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -350,7 +351,8 @@ class _Seed(StudySeed):
         for title, variant in self.variants.items():
             if variant.of == name:
                 evaluation = load_answers(self._path(name))
-                trained = TrainedPolicy(**of_study, params=params, test=test, noise=noise, evaluation=evaluation)
+                made: dict[str, Any] = {"params": params, "test": test, "noise": noise, "evaluation": evaluation}
+                trained = TrainedPolicy(**of_study, **made, folder=policy_folder(self.context, name, self.seed))
                 self._evaluate(title, functools.partial(variant.evaluate, trained))
 
     def _evaluate(self, name: str, evaluate: Callable[[], Evaluation]) -> None:

@@ -12,6 +12,7 @@ from experiments.study.stages import StudySFT
 from sensors_io.pipeline import ClipConfig
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import ATTRIBUTES, Flag
+from sensors_io.selection import Shown
 from touchr1_jax.bench.metrics import ORDINAL
 from touchr1_jax.distributed.processes import GIB
 from touchr1_jax.models.lora import LoraConfig
@@ -70,6 +71,8 @@ class TrainingConfig(SourceConfig):
     """Threads that read clips ahead; on two cores a second one would only take time from the step."""
     noise_contacts: int = 64
     """Contacts whose pixels and forces give noise its statistics; they are in memory at once."""
+    show: Shown = "pictures"
+    """`fields` shows the policy depth and deformation as images in the place of pictures, where records have both."""
     model: TouchConfig = TouchConfig()
     encoder: Path | None = None
     """Run of `pretrain_encoder`, or its `encoder.npz`, that SFT starts from; its shape replaces `model.tactile`."""
@@ -91,8 +94,8 @@ class TrainingConfig(SourceConfig):
     """Rewards that every arm earns besides its own, as in `overlong 0.1 diversity 0.05`."""
     grpo_steps: int = 150
     grpo_save_every: int = 150
-    grpo_lora_rank: int = 0
-    """Rank of adapters that GRPO trains in the place of the decoder's weights; 0 trains the weights."""
+    lora: LoraConfig = LoraConfig(rank=0)
+    """Adapters that SFT and GRPO train in the place of the adapted towers' weights; rank 0 trains the weights."""
     samples: int = 8
     """Sampled answers to each test question, for pass@k, maj@k and calibration; 0 asks for greedy answers only."""
 
@@ -113,15 +116,10 @@ class TrainingConfig(SourceConfig):
         """Steps of GRPO and when they are saved."""
         return LoopConfig(steps=self.grpo_steps, save_every=self.grpo_save_every)
 
-    @property
-    def grpo_lora(self) -> LoraConfig | None:
-        """Adapters that GRPO trains, or none."""
-        return LoraConfig(rank=self.grpo_lora_rank) if self.grpo_lora_rank else None
-
     def __post_init__(self) -> None:
         super().__post_init__()
         at_least(self, 1, "seeds", "grpo_save_every", "read_threads", "noise_contacts")
-        at_least(self, 0, "clip_memory_gib", "grpo_steps", "grpo_lora_rank", "samples", "anchor")
+        at_least(self, 0, "clip_memory_gib", "grpo_steps", "samples", "anchor")
         if not self.sft.steps and (self.recipe == "paper" or not self.encoders.steps):
             raise ValueError(
                 f"sft.steps is 0: must be at least 1 where recipe {self.recipe!r} trains the encoders by nothing else; "
@@ -155,6 +153,7 @@ def open_data(config: TrainingConfig, view_px: int, context: Context) -> Dataset
         image_px=config.model.image_px,
         view_px=view_px,
         rejected=(Flag.NOT_CONVERGED, Flag.SATURATED),
+        show=config.show,
     )
     context.print(require_memory({"clips at most": round(config.clip_memory_gib * GIB)}))
     path = prepare_records(config, context)

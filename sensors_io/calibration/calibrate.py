@@ -32,8 +32,8 @@ class CalibrateConfig:
         recordings of lamps of several colours have 0.41 to 0.96, two sensors of one light 0.08 to 0.10.
       contact_radii: between which the median contact radius must lie, in ball radii.
       most_depth_um, most_radius: held-out errors beyond which nothing was learnt.
-      sure_radius, sure_bias: held-out error of the radius and its part that all presses share, beyond which a warning
-        says that the map will not transfer to other objects.
+      sure_depth_um, sure_radius, sure_bias: held-out errors of depth and radius, and the part of the latter that all
+        presses share, beyond which a warning says that the map will not transfer to other objects.
       sure_cover: share of the window that presses must cover, below which a warning says where to press.
     """
 
@@ -48,8 +48,9 @@ class CalibrateConfig:
     contact_radii: tuple[float, float] = (0.15, 0.95)
     most_depth_um: float = 60.0
     most_radius: float = 0.25
+    sure_depth_um: float = 20.0
     sure_radius: float = 0.05
-    sure_bias: float = 0.04
+    sure_bias: float = 0.03
     sure_cover: float = 0.8
     seed: int = 0
 
@@ -237,10 +238,12 @@ def _warnings(errors: BallErrors, touches: Touches, shape: tuple[int, int], conf
     """Why the map may not transfer, and what to do about it."""
     figures, said = errors.figures(), []
     radius, bias = (figures[f"radius error {name}, %"] / 100 for name in ("median", "of the median"))
-    if radius > config.sure_radius:
+    depth_um = figures["depth rmse median, um"]
+    if radius > config.sure_radius or depth_um > config.sure_depth_um:
         said.append(
-            f"the map will not transfer: unseen presses have a radius error of {radius:.1%}, must be "
-            f"≤ {config.sure_radius:.1%}; press more often, all over the window, with contacts of several sizes"
+            f"the map will not transfer: unseen presses have a radius error of {radius:.1%} and a depth error of "
+            f"{depth_um:.0f} um, must be ≤ {config.sure_radius:.1%} and ≤ {config.sure_depth_um:.0f} um; press more "
+            "often, all over the window, with contacts of several sizes, none wider than 0.8 ball radii"
         )
     if abs(bias) > config.sure_bias:
         said.append(

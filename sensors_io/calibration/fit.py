@@ -40,6 +40,10 @@ RIDGES = tuple(10 ** (0.5 * k) for k in range(-15, -5))
 INNER = 0.95
 """Contact radii from the centre, up to which pixels of the ball are taken."""
 
+RIM, RIM_WEIGHT = 0.7, 0.2
+"""Contact radii beyond which a pixel of the ball counts less, and its weight: there the normal hangs on the contact's
+radius and on the blur.  Rims that count fully make slopes 1 to 5 % too steep."""
+
 FAR = 2.5
 """Contact radii from the centre, beyond which the gel counts as flat: a layer sinks by less than a tenth there."""
 
@@ -194,7 +198,7 @@ def _grams(presses: BallPresses, touches: Touches, before: ColourMap | None) -> 
         normal = imprint(dx_mm, dy_mm, row[2] * presses.mm_per_px)[:2].T
         normal[len(ball) :] = 0
         weight = np.full(len(index), FLAT_SHARE * len(ball) / max(len(flat), 1))
-        weight[: len(ball)] = 1
+        weight[: len(ball)] = np.where(away.ravel()[ball] > RIM * row[2], RIM_WEIGHT, 1)
         seen = np.stack([c.ravel()[index] for c in change(picture, presses.background)]).astype(np.float64)
         design = _design(places.reshape(len(places), -1)[:, index], colour_powers(seen, DEGREE))
         if before is not None:

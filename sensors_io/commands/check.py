@@ -4,17 +4,15 @@ import collections
 import dataclasses
 import pathlib
 
-import numpy as np
 import tyro
 from rich.table import Table
 
 from sensors_io import overview, quality
 from sensors_io.commands.console import OUT, complain, progress_bar
-from sensors_io.fields.extract import Extractor
+from sensors_io.fields.recorded import RecordedGels, RestGel
 from sensors_io.fields.sources import read_picture
-from sensors_io.fields.types import Calibration, CalibrationError
+from sensors_io.fields.types import Calibration
 from sensors_io.records import CorruptRecordsError, IncompleteRecordsError, RecordsError, RecordStore
-from sensors_io.schema import Flag, SchemaError, Sequence
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -32,7 +30,11 @@ class Check:
     pictures: bool = False
     """Judge the pictures too, against the gel at rest that was recorded with them, or else `--background`."""
     background: pathlib.Path | None = None
-    """Picture of the gel at rest, if none was recorded."""
+    """Picture of the gel at rest, if none was recorded, at the size of the pictures or at one of the same window."""
+    rest_frames: int = 0
+    """Frames at the start of each recording that show the gel at rest, if no picture of it was recorded."""
+    mm_per_px: float | None = None
+    """Millimetres per pixel of the recorded pictures, if none were recorded or imported with them."""
     calibration: pathlib.Path | None = None
     """Calibration from `calibrate`: contact is then judged by depth, and mm per pixel are known."""
 
@@ -41,7 +43,7 @@ class Check:
         recorded, judged, looked = overview.FlagCounts(), overview.FlagCounts(), overview.FlagCounts()
         unseen: collections.Counter[str] = collections.Counter()
         problems: list[RecordsError] = []
-        eye = _Eye(self.records, self.background, self.calibration)
+        gels = self._gels(store)
         with progress_bar("contacts") as progress:
             for i in range(len(store)):
                 try:
@@ -54,11 +56,12 @@ class Check:
                     found = quality.judge(sequence)
                     judged.add(quality.judged(sequence, found), found)
                 for sequence in contact if self.pictures else ():
-                    reason = eye.cannot_see(sequence)
+                    reason = gels.problem(sequence)
                     if reason:
                         unseen.update([reason])
                     else:
-                        looked.add(*eye.look(sequence))
+                        fields, extractor = gels.fields(sequence)
+                        looked.add(dataclasses.replace(sequence, flags=fields.flags), extractor.judged)
                 progress(i + 1, len(store))
         OUT.print(overview.summary_table(store))
         left_out = _left_out(store)
@@ -76,6 +79,11 @@ class Check:
         for problem in problems:
             complain(problem)
         return 1 if problems else 0
+
+    def _gels(self, store: RecordStore) -> RecordedGels:
+        background = None if self.background is None else read_picture(self.background)
+        gel = RestGel(background=background, rest_frames=self.rest_frames, mm_per_px=self.mm_per_px)
+        return RecordedGels(store.path, gel, None if self.calibration is None else Calibration.load(self.calibration))
 
 
 def _left_out(store: RecordStore) -> collections.Counter[str]:
@@ -95,65 +103,3 @@ def _counted(reasons: collections.Counter[str]) -> Table:
 
 
 _MOST_REASONS = 12  # that are listed one by one
-
-
-class _Eye:
-    """Judges pictures of records by the extraction of their fields."""
-
-    def __init__(self, records: pathlib.Path, background: pathlib.Path | None, calibration: pathlib.Path | None):
-        self._records = records
-        self._given = None if background is None else read_picture(background)
-        self._calibration = None if calibration is None else Calibration.load(calibration)
-        self._extractors: dict[tuple[str, float], Extractor] = {}
-
-    def cannot_see(self, sequence: Sequence) -> str:
-        """Why a sequence cannot be judged; empty if it can."""
-        if sequence.frames is None:
-            return "they hold no pictures"
-        rest = self._at_rest(sequence)
-        if rest is None:
-            return "no gel at rest was recorded with them: give --background"
-        if rest.shape != sequence.frames.shape[1:]:
-            return (
-                f"their pictures are {sequence.frames.shape[1:3]}, the gel at rest is {rest.shape[:2]}: crop them alike"
-            )
-        if self._pitch(sequence) is None:
-            return "nothing tells their mm per px: give --calibration, or record with the device's --mm-per-px"
-        try:
-            self._extractor(sequence)
-        except (SchemaError, CalibrationError) as error:
-            return str(error)
-        return ""
-
-    def look(self, sequence: Sequence) -> tuple[Sequence, tuple[Flag, ...]]:
-        """The sequence with the flags that its pictures show, in place of its own, and those that they could show."""
-        assert sequence.frames is not None
-        extractor = self._extractor(sequence)
-        fields = extractor.extract(sequence.frames)
-        return dataclasses.replace(sequence, flags=fields.flags), extractor.judged
-
-    def _extractor(self, sequence: Sequence) -> Extractor:
-        """Made once for each gel at rest."""
-        rest, pitch = self._at_rest(sequence), self._pitch(sequence)
-        assert pitch is not None
-        assert rest is not None
-        gel = _background(sequence), pitch
-        if gel not in self._extractors:
-            self._extractors[gel] = Extractor(rest, pitch, self._calibration)
-        return self._extractors[gel]
-
-    def _pitch(self, sequence: Sequence) -> float | None:
-        """The one that was recorded, else the calibration's."""
-        if sequence.mm_per_px is None and self._calibration is not None:
-            return self._calibration.mm_per_px
-        return sequence.mm_per_px
-
-    def _at_rest(self, sequence: Sequence) -> np.ndarray | None:
-        name = _background(sequence)
-        return read_picture(self._records / name) if name else self._given
-
-
-def _background(sequence: Sequence) -> str:
-    """File of the gel at rest that was recorded with a sequence, empty where none was."""
-    name: str = sequence.camera.get("recording", {}).get("background") or ""
-    return name

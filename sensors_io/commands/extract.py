@@ -10,12 +10,18 @@ import numpy as np
 import tyro
 from rich.table import Table
 
+from sensors_io import overview
 from sensors_io.commands.console import OUT, progress_bar
 from sensors_io.commands.straightening import Straightening
+from sensors_io.fields.beside import FieldsJob, fields_beside
 from sensors_io.fields.extract import ExtractConfig, Extractor, joined
+from sensors_io.fields.recorded import RestGel
 from sensors_io.fields.sources import SourceError, read_picture, read_pictures
 from sensors_io.fields.types import Calibration, CalibrationError, Fields, write_whole
+from sensors_io.index import INDEX
+from sensors_io.records import RecordStore
 from sensors_io.schema import Flag
+from sensors_io.units import Launcher
 
 _REFUSED = (("depth_mm", (1, 1)), ("deformation_mm", (1, 1, 2)), ("shear_mm", (1, 1, 2)))
 """Fields that a file always holds, and their shape in a frame that cannot carry them."""
@@ -26,22 +32,29 @@ class Extract:
     """Extract depth, contact, deformation, shear and force from pictures, as arrays over frames in one npz file.
 
     A field that the input cannot carry is flagged in every frame, said so, and written as NaN on a grid of one point.
+    Records become new records with the fields beside the pictures if `--out` names a directory; an interrupted
+    extraction resumes.
     """
 
     inputs: tyro.conf.Positional[tuple[pathlib.Path, ...]]
     """Pictures, folders, videos or records."""
-    background: pathlib.Path
-    """Picture of the gel at rest."""
     out: pathlib.Path
-    """File to write (.npz)."""
+    """File to write (.npz), or, from one directory of records, the directory of the new records."""
+    background: pathlib.Path | None = None
+    """Picture of the gel at rest; of records, for recordings that have none of their own."""
+    rest_frames: int = 0
+    """Of records: frames at the start of each recording that show the gel at rest, if no picture of it was recorded."""
     sensor: str = "gelsight_mini"
     """Name of the sensor; of records, its frames are read."""
     calibration: pathlib.Path | None = None
     """Calibration from `calibrate`; without it, neither depth nor shear is computed."""
     mm_per_px: float | None = None
-    """Millimetres per pixel; by default those of the calibration or the geometry."""
+    """Millimetres per pixel; by default those of the recording, the calibration or the geometry."""
     geometry: pathlib.Path | None = None
     """File written by `geometry`: pictures are rectified first. Must be the file that `calibrate` was given."""
+    rows: int = 0
+    """Of new records: rows of the fields; 0 takes those of the pictures."""
+    launcher: Annotated[Launcher, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Launcher)
     config: Annotated[ExtractConfig, tyro.conf.arg(name="")] = dataclasses.field(default_factory=ExtractConfig)
 
     def run(self) -> int:
@@ -49,6 +62,43 @@ class Extract:
         if calibration is not None and calibration.sensor != self.sensor:
             raise CalibrationError(
                 f"{self.calibration} is for {calibration.sensor!r}, not {self.sensor!r}: must be equal; set --sensor"
+            )
+        if self.out.suffix == ".npz":
+            return self._to_file(calibration)
+        return self._to_records(calibration)
+
+    def _to_records(self, calibration: Calibration | None) -> int:
+        """New records, with the fields beside the pictures."""
+        if len(self.inputs) != 1 or not (self.inputs[0] / INDEX).exists():
+            raise SourceError(
+                f"--out is {self.out}: must end in .npz unless the input is one directory of records; correct it"
+            )
+        if self.geometry is not None:
+            raise SourceError(
+                f"--geometry is {self.geometry}: pictures of records are stored as they are; extract to an .npz"
+            )
+        background = None if self.background is None else read_picture(self.background)
+        job = FieldsJob(
+            records=self.inputs[0].absolute(),
+            sensor=self.sensor,
+            gel=RestGel(background=background, rest_frames=self.rest_frames, mm_per_px=self.mm_per_px),
+            calibration=calibration,
+            config=self.config,
+            rows=self.rows,
+        )
+        with progress_bar("contacts") as progress:
+            fields_beside(job, self.out, progress=progress, launcher=self.launcher)
+        OUT.print(overview.summary_table(RecordStore(self.out)))
+        return 0
+
+    def _to_file(self, calibration: Calibration | None) -> int:
+        """Arrays over all frames of all inputs."""
+        if self.background is None:
+            raise SourceError("--background is not given: must be a picture of the gel at rest; take one")
+        if self.rest_frames or self.rows or not self.launcher.here:
+            raise SourceError(
+                f"--rest-frames, --rows and --launcher are of records, --out is {self.out}: must be a directory for "
+                "them; leave them out"
             )
         rest = read_picture(self.background)
         straight = self._straightening(calibration, (rest.shape[0], rest.shape[1]))

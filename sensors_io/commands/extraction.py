@@ -25,9 +25,9 @@ class Extraction:
 
     def channels(self, devices: Seq[Reader]) -> list[Channel]:
         """One channel of the page for every device."""
-        return [Channel(device, self._extractor(device) if i == 0 else None) for i, device in enumerate(devices)]
+        return [Channel(device, self.extractor(device) if i == 0 else None) for i, device in enumerate(devices)]
 
-    def _extractor(self, device: Reader) -> Extractor | None:
+    def extractor(self, device: Reader) -> Extractor | None:
         if self._background is None:
             return None
         calibration = None if self._calibration is None else Calibration.load(self._calibration)

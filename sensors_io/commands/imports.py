@@ -10,9 +10,11 @@ import tyro
 
 from sensors_io import overview
 from sensors_io.commands.console import OUT, progress_bar
+from sensors_io.exporters.exported import import_exported
 from sensors_io.importers.catalogue import Catalogue, import_catalogue
 from sensors_io.importers.estimate_modulus import list_estimate_modulus
 from sensors_io.importers.feelanyforce import FeelAnyForceConfig, list_feelanyforce
+from sensors_io.importers.gel import NO_GEL, SourceGel
 from sensors_io.importers.hdf5 import HDF5Config, hdf5_files, list_hdf5
 from sensors_io.importers.hdf5_inspect import UNKNOWN_UNIT, describe, propose
 from sensors_io.importers.hdf5_read import HDF5Error
@@ -26,6 +28,7 @@ from sensors_io.importers.tvl import list_tvl
 from sensors_io.importers.videos import VideosConfig, list_videos
 from sensors_io.importers.vtv150k import VTVConfig, list_vtv150k
 from sensors_io.importers.ycb_slide import list_ycb_slide
+from sensors_io.records import RecordStore
 from sensors_io.schema import SPLITS
 
 
@@ -37,6 +40,14 @@ class _Paths:
     """Directory of the data set as it is published, or of your clips."""
     out: pathlib.Path
     """Directory of the records."""
+    mm_per_px: float | None = None
+    """Millimetres per pixel of the published pictures, for `check` and `extract`; kept at the size that is stored."""
+    background: pathlib.Path | None = None
+    """Picture of the gel at rest at the size of the published pictures, kept for `check` and `extract`."""
+
+    def gel(self) -> SourceGel:
+        """The gel of its sensor."""
+        return SourceGel(mm_per_px=self.mm_per_px, background=self.background)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -177,9 +188,27 @@ class Hdf5:
         return 0
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Exported:
+    """LeRobotDataset, Zarr folder or HDF5 file that `export` wrote."""
+
+    source: tyro.conf.Positional[pathlib.Path]
+    """The export."""
+    out: pathlib.Path
+    """Directory of the records."""
+
+    def run(self) -> int:
+        """Write the records, and say what they hold."""
+        with progress_bar("contacts") as progress:
+            import_exported(self.source, self.out, progress)
+        OUT.print(overview.summary_table(RecordStore(self.out)))
+        return 0
+
+
 DataSet = (
     Annotated[Videos, tyro.conf.subcommand("videos")]
     | Annotated[Hdf5, tyro.conf.subcommand("hdf5")]
+    | Annotated[Exported, tyro.conf.subcommand("exported")]
     | Annotated[Physiclear, tyro.conf.subcommand("physiclear")]
     | Annotated[Octopi, tyro.conf.subcommand("octopi")]
     | Annotated[TouchAndGo, tyro.conf.subcommand("touch-and-go")]
@@ -200,11 +229,14 @@ class Import:
     dataset: DataSet
 
     def run(self) -> int:
+        if isinstance(self.dataset, Exported):
+            return self.dataset.run()
         if isinstance(self.dataset, Hdf5) and self.dataset.inspect:
             return self.dataset.show()
+        gel = self.dataset.gel() if isinstance(self.dataset, _Paths) else NO_GEL
         catalogue = self.dataset.catalogue()
         with progress_bar("contacts") as progress:
-            report = import_catalogue(catalogue, self.dataset.out, progress=progress)
+            report = import_catalogue(catalogue, self.dataset.out, gel=gel, progress=progress)
         OUT.print(overview.import_table(report))
         if any(report.objects[split] for split in SPLITS if split != "unlabelled"):
             train = (

@@ -22,12 +22,16 @@ class ZeroConfig:
     Args:
       steep: slope beyond which a cell belongs to a contact or its rim.
       margin_mm: around such cells, nothing is taken for untouched: the gel sinks there too.
+      near_mm, sinks_mm: distance from such cells from which on the zero level is fitted, beside a sinking that decays
+        by 1/e over `sinks_mm`; around presses at known depth it is some 60 µm at 2 mm.
       bent, tilted: least share of untouched cells, for which a quadratic and a plane are fitted; below it a constant,
         and no zero level is known.
     """
 
     steep: float = STEEP
     margin_mm: float = 3.0
+    near_mm: float = 2.0
+    sinks_mm: float = 2.5
     bent: float = 0.4
     tilted: float = 0.15
 
@@ -108,7 +112,8 @@ def _cells(field: np.ndarray) -> tuple[int, int]:
 def zero_level(depth_mm: np.ndarray, slope: np.ndarray, mm_per_px: float, config: ZeroConfig) -> np.ndarray:
     """Depth that untouched gel shows, continued under the contact: a quadratic, a plane or a constant by least squares.
 
-    A lamp that warms up, or a gel that settles, tilts and bends the zero level by tens of micrometres.
+    A lamp that warms up, or a gel that settles, tilts and bends the zero level by tens of micrometres.  Around contacts
+    gel sinks too, by A exp(−d / `sinks_mm`) at the distance d, A ≥ 0: it is fitted with the level and is no part of it.
 
     Args:
       depth_mm, slope: float32 [H, W] each; the length of the slopes.
@@ -125,8 +130,25 @@ def zero_level(depth_mm: np.ndarray, slope: np.ndarray, mm_per_px: float, config
     degree = 2 if share >= config.bent else 1 if share >= config.tilted else 0
     if not still.any():
         still = coarse <= np.quantile(coarse, 0.05)
-    low = np.linalg.lstsq(_powers(rows, columns, degree)[still.ravel()], coarse[still], rcond=None)[0]
+    terms = _powers(rows, columns, degree)
+    low = np.linalg.lstsq(terms[still.ravel()], coarse[still], rcond=None)[0]
+    if degree:
+        away_mm = _distance_mm(slope, mm_per_px, config)
+        near = away_mm > config.near_mm
+        sinking = np.exp(-away_mm / np.float32(config.sinks_mm))
+        both = np.column_stack([terms, sinking.ravel()])
+        fitted = np.linalg.lstsq(both[near.ravel()], coarse[near], rcond=None)[0]
+        low = fitted[:-1] if fitted[-1] > 0 else low  # gel that rises beside a contact is a fault of the slopes
     return (_powers(*depth_mm.shape, degree) @ low.astype(np.float32)).reshape(depth_mm.shape)
+
+
+def _distance_mm(slope: np.ndarray, mm_per_px: float, config: ZeroConfig) -> np.ndarray:
+    """Distance of every cell from the nearest steep one, float32 [H // CELL_PX, W // CELL_PX]."""
+    steep = cv2.resize(slope, _cells(slope), interpolation=cv2.INTER_AREA) > config.steep
+    if not steep.any():
+        return np.full(steep.shape, np.inf, np.float32)
+    away: np.ndarray = cv2.distanceTransform((~steep).astype(np.uint8), cv2.DIST_L2, 5)
+    return away * np.float32(mm_per_px * CELL_PX)
 
 
 @functools.lru_cache(maxsize=16)

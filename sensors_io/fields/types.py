@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Mapping
 from typing import Any, Self
 
+import cv2
 import numpy as np
 
 from sensors_io.arrays import load_arrays
@@ -102,6 +103,24 @@ class Calibration:
         for array in (self.colours.weights, self.background):
             digest.update(f"{array.dtype}{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()[:16]
+
+    def at_size(self, size_px: tuple[int, int]) -> Self:
+        """The calibration for pictures of the same window at another size: the map depends on the place in the window.
+
+        Args:
+          size_px: rows and columns.
+
+        Raises:
+          CalibrationError: a window of another shape.
+        """
+        rows, columns = self.background.shape[:2]
+        if round(columns * size_px[0] / rows) != size_px[1]:
+            raise CalibrationError(
+                f"calibration is for pictures of {rows} × {columns} px, these are {size_px[0]} × {size_px[1]}: both "
+                "must show the same window; crop them alike, or calibrate this camera"
+            )
+        background = cv2.resize(self.background, size_px[::-1], interpolation=cv2.INTER_AREA)
+        return dataclasses.replace(self, background=background, mm_per_px=self.mm_per_px * rows / size_px[0])
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write it as one npz, whole or not at all."""

@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Seq
 from typing import Any
 
+from sensors_io.importers.gel import NO_GEL, SourceGel
 from sensors_io.importers.holdout import split_by_name
 from sensors_io.importers.keep import ImportSourceError, Shares, Skip, UnreadableError, at_height
 from sensors_io.importers.pictures import read_picture
@@ -96,28 +97,35 @@ class ImportReport:
 
 
 def import_catalogue(
-    catalogue: Catalogue, out: pathlib.Path, *, progress: Callable[[int, int], None] | None = None
+    catalogue: Catalogue,
+    out: pathlib.Path,
+    *,
+    gel: SourceGel = NO_GEL,
+    progress: Callable[[int, int], None] | None = None,
 ) -> ImportReport:
     """Write what a catalogue lists as records in `out`; an interrupted import goes on, a finished one is kept.
 
     Args:
       catalogue: the source.
       out: directory of the records.
+      gel: of its sensor, kept with the records.
       progress: called with the number of contacts done and their total.
 
     Raises:
-      ImportSourceError: no contact of the source can be read.
+      ImportSourceError: no contact of the source can be read, or a gel for several sensors.
       RecordsExistError: `out` holds other records.
     """
+    gel.require_one_sensor(catalogue.sensors)
     meta = RecordsMeta(
         source=catalogue.source,
         licence=catalogue.licence,
-        config_hash=catalogue.identity,
+        config_hash=gel.identity(catalogue.identity),
         sensors=catalogue.sensors,
         notes={"config": catalogue.config},
     )
     with RecordWriter(out, meta=meta, resume=True) as writer:
-        run = _Run(writer, catalogue, dict(writer.notes.get(_NOTE, {})))
+        gel.store(out)
+        run = _Run(writer, catalogue, gel, dict(writer.notes.get(_NOTE, {})))
         for n, listed in enumerate(catalogue.contacts):
             run.add(n, listed)
             if progress is not None:
@@ -136,6 +144,7 @@ class _Run:
 
     writer: RecordWriter
     catalogue: Catalogue
+    gel: SourceGel
     notes: dict[str, list[dict[str, str]]]
     unread: list[Skip] = dataclasses.field(default_factory=list)
 
@@ -156,7 +165,7 @@ class _Run:
         if left_out:
             self.notes[str(n)] = [dataclasses.asdict(skip) for skip in left_out]
             self.writer.note(**{_NOTE: self.notes})
-        self.writer.write_contact(taken.sequences)
+        self.writer.write_contact([self.gel.kept(sequence) for sequence in taken.sequences])
 
     def report(self) -> ImportReport:
         """Report of recordings that were imported and left out."""

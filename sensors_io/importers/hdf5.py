@@ -19,7 +19,7 @@ import numpy as np
 
 from sensors_io.importers.catalogue import Catalogue, Listed, fingerprint, require_files
 from sensors_io.importers.hdf5_map import ArrayMap, LayoutMap, ValueMap, read_map
-from sensors_io.importers.hdf5_read import HDF5Error, Place, bounds, dataset, h5py, opened, read_contact
+from sensors_io.importers.hdf5_read import HDF5Error, Place, bounds, dataset, h5py, named, opened, read_contact
 from sensors_io.importers.holdout import split_by_name
 from sensors_io.importers.keep import ImportConfig, ImportSourceError, Skip
 from sensors_io.schema import ATTRIBUTES, MATERIALS, ContactKey, ObjectCard, SchemaError
@@ -101,7 +101,7 @@ def hdf5_files(source: pathlib.Path) -> list[pathlib.Path]:
 def contact_places(path: pathlib.Path, file: Any, layout: LayoutMap) -> Iterator[Place]:
     """Contacts of a file, in the order of the numbers in the names of their groups."""
     groups = ["/"]
-    file.visititems(lambda name, item: groups.append(f"/{name}") if isinstance(item, h5py().Group) else None)
+    file.visititems(lambda name, item: groups.append(f"/{named(name)}") if isinstance(item, h5py().Group) else None)
     wanted = layout.contact if layout.contact.startswith("/") else f"/{layout.contact}"
     depth = wanted.count("/")
     fits = lambda name: (

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sensors_io.importers.hdf5_map import QUANTITIES, UNITS
-from sensors_io.importers.hdf5_read import SPELLED, STATED, h5py, opened
+from sensors_io.importers.hdf5_read import SPELLED, STATED, h5py, named, opened
 from sensors_io.schema import SENSORS
 
 UNKNOWN_UNIT = "?"
@@ -78,6 +78,7 @@ def _lines(group: Any, indent: str) -> Iterator[str]:
         yield f"{indent}@{name} = {value!s:.60}"
     seen: Counter[tuple[Any, ...]] = Counter()
     for name, item in group.items():
+        named(name)
         if isinstance(item, h5py().Dataset):
             stated = ", ".join(f"{a} {item.attrs[a]}" for a in STATED if a in item.attrs)
             yield f"{indent}{name}  {item.dtype}{list(item.shape)}{f'  ({stated})' if stated else ''}"
@@ -101,7 +102,7 @@ def _contents(group: Any) -> tuple[Any, ...]:
 
 def _datasets(group: Any) -> Iterator[tuple[str, Any]]:
     found: list[tuple[str, Any]] = []
-    group.visititems(lambda name, item: found.append((name, item)) if isinstance(item, h5py().Dataset) else None)
+    group.visititems(lambda name, item: found.append((named(name), item)) if isinstance(item, h5py().Dataset) else None)
     yield from found
 
 

@@ -76,6 +76,17 @@ def opened(path: pathlib.Path) -> Iterator[Any]:
         raise HDF5Error(f"cannot be read: {str(error).strip(chr(39))}") from error
 
 
+def named(name: str | bytes) -> str:
+    """The name of a group or data set, which h5py leaves as bytes where it is not UTF-8.
+
+    Raises:
+      HDF5Error: it is not.
+    """
+    if isinstance(name, bytes):
+        raise HDF5Error(f"the name {name!r} is not UTF-8: the file is damaged, or rename it")
+    return name
+
+
 def bounds(file: Any, group: str, rows: RowsMap) -> np.ndarray:
     """First row of each contact in arrays that hold the rows of all, and their end, int64 [contacts + 1].
 

@@ -8,9 +8,9 @@ import pytest
 
 from experiments.core.runner import main
 from experiments.paper import presets, touch_r1
-from experiments.study.stages import StudySFT
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.models.lora import LoraConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import ModelConfig
 
@@ -53,9 +53,7 @@ from touchr1_jax.models.touch_policy import ModelConfig
         ("paper.grpo_verdict.GrpoVerdictConfig", {"presets": ()}, "presets"),
         ("paper.pareto_sft.ParetoSFTConfig", {"end_to_end": (0,)}, "end_to_end is .0,.: must hold"),
         ("paper.pareto_sft.ParetoSFTConfig", {"decoder": ()}, "decoder is ..: must hold"),
-        ("paper.touch_r1.DEFAULT", {"sft": StudySFT()}, r"sft\.lora_rank is 0: must be at least 1"),
-        ("paper.touch_r1.DEFAULT", {"blind": StudySFT()}, r"blind\.lora_rank is 0: must be at least 1"),
-        ("paper.touch_r1.DEFAULT", {"grpo_lora_rank": 0}, "grpo_lora_rank is 0: must be at least 1, released"),
+        ("paper.touch_r1.DEFAULT", {"lora": LoraConfig(rank=0)}, r"lora\.rank is 0: must be at least 1, released"),
         (
             "paper.touch_r1.DEFAULT",
             {"model": dataclasses.replace(touch_r1.DEFAULT.model, dtype="float32")},
@@ -71,7 +69,6 @@ from touchr1_jax.models.touch_policy import ModelConfig
         ("study.sources.SourceConfig", {"data": "physiclear"}, "data_dir is None: data 'physiclear' needs data_dir"),
         ("study.sources.SourceConfig", {"data": "records"}, "data_dir is None: data 'records' needs data_dir"),
         ("study.stages.StudySFT", {"pack": -1}, "pack is -1: must be at least 0"),
-        ("study.stages.StudySFT", {"lora_rank": -1}, "lora_rank is -1: must be at least 0"),
         ("study.stages.StudySFT", {"curriculum": 1.5}, r"curriculum is 1\.5: must lie in 0 … 1"),
         (
             "study.study.StudyConfig",

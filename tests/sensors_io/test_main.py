@@ -143,9 +143,12 @@ def test_a_picture_that_there_is_not_is_one_line(run, tmp_path, monkeypatch, arg
         (["devices", "--wait-s", "1e300"], "wait_s is 1e+300: must be"),
         (["view", "--port", "99999", *REPLAY], "port is 99999: must lie in 0 … 65535"),
         (["view", *REPLAY, "+", "tac3d", "--port", "70000"], "port is 70000: must lie in 0 … 65535"),
+        (["list", "/dev/zero"], "records is /dev/zero: must be a file or a folder, not a pipe or a device"),
+        (["extract", "/dev/zero", "--background", "b", "--out", "o"], "inputs is /dev/zero: must be a file"),
+        (["label", "r", "--labels", "/dev/zero", "--annotator", "a"], "labels is /dev/zero: must be a file"),
     ],
 )
-def test_a_number_that_nobody_means_is_one_line(run, args, message):
+def test_a_value_that_nobody_means_is_one_line(run, args, message):
     status, out, err = run(*args)
     assert (status, out) == (2, "")
     assert err.startswith(f"ValueError: {message}")

@@ -1,5 +1,6 @@
 """Clips and their batches: shapes and masks by hand, order by seed, resumed = uninterrupted."""
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -258,3 +259,25 @@ def test_readers_that_join_or_leave_change_shares_and_not_the_epoch(store):
     assert sorted(seen) == sorted(rows)
     whole = clip_batches(store, rows, config, batch_size=batch, seed=3, repeat=False, drop_remainder=True)
     assert seen == [int(i) for one in whole for i in one["contact"]]
+
+
+def test_a_clip_shows_fields_in_the_place_of_pictures_where_asked():
+    """The same frames, seen as deformation and depth; exposure does not touch them; pictures alone are refused."""
+    config = ClipConfig(frames=4, image_px=8, view_px=6, sensors=("gelsight_mini",), show="fields")
+    recorded = fakes.sequence(0)
+    shown = make_clip({"gelsight_mini": recorded}, fakes.card(0), config)
+    bare = dataclasses.replace(recorded, frames=None)
+    np.testing.assert_array_equal(shown.frames, make_clip({"gelsight_mini": bare}, fakes.card(0), config).frames)
+    pictures = make_clip({"gelsight_mini": recorded}, fakes.card(0), dataclasses.replace(config, show="pictures"))
+    assert (shown.frame_index == pictures.frame_index).all()
+    assert (shown.frames != pictures.frames).any()
+    alone = dataclasses.replace(recorded, depth_mm=None, deformation_mm=None, valid=None)
+    refused(SchemaError, "has no fields, and show", make_clip, {"gelsight_mini": alone}, fakes.card(0), config)
+
+
+def test_batches_read_the_fields_that_they_show(tmp_path):
+    store = RecordStore(fakes.write(tmp_path, 2, sensors=("gelsight_mini",)))
+    config = ClipConfig(frames=4, image_px=8, view_px=6, sensors=("gelsight_mini",), show="fields")
+    [batch] = clip_batches(store, [0, 1], config, batch_size=2, seed=0, shuffle=False, repeat=False)
+    expected = make_clip(store.contact(0), store.objects["object_0"], config)
+    np.testing.assert_array_equal(batch["frames"][0], expected.frames)

@@ -63,9 +63,9 @@ SHALLOW = make_fns(dataclasses.replace(CONFIG, decoder=dataclasses.replace(CONFI
 
 
 def shallow_params(seed: int = 0, *, loud: float = 0.4) -> Params:
-    """Parameters of the decoder of `SHALLOW`: those of `params` without the second layer."""
+    """Parameters of the decoder of `SHALLOW`: those of the last layer of `params`."""
     decoder = params(seed, loud=loud)["decoder"]
-    return {"decoder": {name: value for name, value in decoder.items() if name != "layers_1"}}
+    return {"decoder": {name: value for name, value in decoder.items() if name != "layers"}}
 
 
 @functools.cache
@@ -107,6 +107,12 @@ def features(seed: int = 0, p: int = 1) -> Features:
         view=jnp.asarray(rng.normal(0, 1, (p, NV, width)), jnp.float32),
         view_mask=jnp.ones(p, bool),
     )
+
+
+@jax.jit
+def copy(tree):
+    """The same on buffers of its own, by one program rather than one for each shape."""
+    return jax.tree.map(jnp.copy, tree)
 
 
 def completions(seed: int, *shape: int) -> jax.Array:

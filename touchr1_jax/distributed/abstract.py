@@ -12,12 +12,13 @@ import optax
 
 from touchr1_jax.distributed.memory import Compiled, GRPOShape, compiled_bytes
 from touchr1_jax.distributed.placement import gather_params, shard_step
-from touchr1_jax.models.lora import LoraConfig, LoraFns, Trainable, adapt, init_adapters
+from touchr1_jax.models.lora import LoraConfig, init_adapters
 from touchr1_jax.models.policy import Features, Slots
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.qwen.config import QwenConfig
 from touchr1_jax.models.qwen.model import abstract_params
 from touchr1_jax.models.qwen.policy import qwen_policy
+from touchr1_jax.models.stacked import ADAPTERS, layer_by_layer
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.rl.grpo import FrozenInputs, GRPOState, make_grpo_step, start_state
 from touchr1_jax.rl.rollout import GRPOBatch
@@ -38,6 +39,16 @@ class PromptShape:
     def tokens(self) -> int:
         """L."""
         return self.streams * self.stream_tokens + self.view_tokens + self.text_tokens
+
+    @property
+    def slots(self) -> Slots:
+        """The view, then the streams, then the question."""
+        touch = self.view_tokens + np.arange(self.streams * self.stream_tokens)
+        return Slots(
+            touch=touch.reshape(self.streams, self.stream_tokens),
+            view=np.arange(self.view_tokens),
+            stream_text=np.full(self.tokens, -1),
+        )
 
 
 class AbstractStep(NamedTuple):
@@ -90,7 +101,7 @@ def abstract_grpo(
     decoder = {"decoder": abstract_params(config)["decoder"]}
     fns = PolicyFns(
         module=qwen_policy(config, TactileViTConfig(sensors=s)),
-        slots=_slots(prompt),
+        slots=prompt.slots,
         banned=np.zeros(v, bool),
         end_ids=(v - 1,),
         pad_id=0,
@@ -101,8 +112,8 @@ def abstract_grpo(
     params: Params = decoder
     if lora is not None:
         base = jax.tree.map(lambda x: of(x.shape, jnp.bfloat16), decoder)
-        params = Trainable(adapters=jax.eval_shape(lambda k: init_adapters(k, decoder, lora), key), towers={})
-        fns = adapt(fns, base, lora)
+        params = {ADAPTERS: jax.eval_shape(lambda k: init_adapters(k, decoder, lora), key)}
+        fns = dataclasses.replace(fns, lora=lora)
     state = jax.eval_shape(lambda p, k: start_state(p, optimizer, k, shape.grpo), params, key)
     return AbstractStep(fns, state, batch, FrozenInputs(reference=params, noise=of((draws, s, n, d), kind)), base)
 
@@ -123,26 +134,16 @@ def compile_grpo(
       optimizer: as in `abstract_grpo`.
       devices: those of a topology that is only compiled for; by default as many as needed of this process's.
     """
-    mesh = shape.mesh.build((jax.devices() if devices is None else devices)[: shape.mesh.devices])
+    found = list(jax.devices() if devices is None else devices)
+    mesh = shape.mesh.build(found[: shape.mesh.devices])
+    options = layer_by_layer(jnp.bfloat16) if shape.grpo.bfloat16 and found[0].platform == "cpu" else None
     arguments: tuple[Any, ...] = (abstract.state, abstract.batch, abstract.frozen)
 
     def step(state: GRPOState, batch: GRPOBatch, frozen: FrozenInputs, base: Params | None = None):
-        fns = abstract.fns
-        if isinstance(fns, LoraFns):
-            fns = dataclasses.replace(fns, base=base)
+        fns = dataclasses.replace(abstract.fns, base=base or {})
         gather = functools.partial(gather_params, mesh)
         return make_grpo_step(fns, score, optimizer, shape.grpo, gather=gather)(state, batch, frozen)
 
     if abstract.base is not None:
         arguments = (*arguments, abstract.base)
-    return compiled_bytes(shard_step(step, mesh, *arguments), *arguments)
-
-
-def _slots(prompt: PromptShape) -> Slots:
-    """The view, then the streams, then the question."""
-    touch = prompt.view_tokens + np.arange(prompt.streams * prompt.stream_tokens)
-    return Slots(
-        touch=touch.reshape(prompt.streams, prompt.stream_tokens),
-        view=np.arange(prompt.view_tokens),
-        stream_text=np.full(prompt.tokens, -1),
-    )
+    return compiled_bytes(shard_step(step, mesh, *arguments, compiler_options=options), *arguments)

@@ -69,12 +69,6 @@ def reserved_bytes(compiled: jax.stages.Compiled) -> Compiled:
     )
 
 
-def at_depths(found: Mapping[int, Compiled], layers: int) -> Compiled:
-    """The figures of a decoder of `layers` equal layers from those of two depths: a + b · layers."""
-    (n, shallow), (m, deep) = sorted(found.items())
-    return Compiled(*(a + (layers - n) * (b - a) // (m - n) for a, b in zip(shallow, deep, strict=True)))
-
-
 def held_bytes(mesh: MeshConfig, tree: Any) -> int:
     """Bytes of parameters or of a state on each device, by the rules."""
     shardings = state_shardings(mesh.abstract(), tree)

@@ -1,6 +1,7 @@
 """Sharding of every parameter, of optimizer state, caches and batches on a mesh.
 
-A parameter is placed by the last two names of its path, layer and leaf, since a layer's name tells its role.  Moments
+A parameter is placed by the last two names of its path, layer and leaf, since a layer's name tells its role; one that
+stacks layers is split as each of them is.  Moments
 of an optimizer, averaged and reference parameters are nested as the parameters are and end in the same two names, so
 that one table serves all of them.
 
@@ -15,6 +16,7 @@ import jax
 from jax.sharding import AbstractMesh, Mesh, NamedSharding, PartitionSpec
 
 from touchr1_jax.distributed.mesh import DATA, FSDP, TENSOR
+from touchr1_jax.models.stacked import STACKED
 
 AnyMesh = Mesh | AbstractMesh
 Axis = str | None
@@ -141,10 +143,13 @@ def rule(path: str, rank: int) -> tuple[Axis, ...]:
     Raises:
       ValueError: a path that no rule names, or a rule for arrays of another rank.
     """
-    *_, layer, leaf = ("", *path.split("/"))
+    modules = path.split("/")
+    *_, layer, leaf = ("", *modules)
     axes = _rule(re.sub(r"_\d+$", "", layer), leaf)
     if axes is None:
         raise ValueError(f"parameter {path} has no sharding rule; name its layer or leaf in distributed/rules.py")
+    if STACKED.intersection(modules):
+        axes = (None, *axes)
     if len(axes) != rank:
         raise ValueError(
             f"parameter {path} has {rank} dimensions, its sharding rule {axes} has {len(axes)}; match them"

@@ -6,15 +6,16 @@ rollouts shares one prompt, so the keys of the prompt (`PrefixCache`) are an arg
 """
 
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from flax import struct
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
+from touchr1_jax.models.blocked_attention import LayerCache, Segments, attend_causally, attend_in_segments
 from touchr1_jax.models.layers import (
     MASKED,
     GatedMLP,
@@ -28,6 +29,7 @@ from touchr1_jax.models.layers import (
     mrope,
     rotate,
 )
+from touchr1_jax.models.stacked import scan_layers
 from touchr1_jax.models.vmappable_dense import Dense, Embed, product_with_weights
 from touchr1_jax.validation import above
 
@@ -58,30 +60,19 @@ class DecoderConfig:
         above(self, 0, "rope_theta", "norm_epsilon")
 
 
-class LayerCache(NamedTuple):
-    """Keys and values of one layer, head-major: a time-major layout is several times slower to attend to."""
+class Caches(NamedTuple):
+    """Keys and values of all layers: those before the last stacked along a first axis, as their parameters are."""
 
-    k: Float[Array, "KV *g T d"]
-    v: Float[Array, "KV *g T d"]
+    layers: LayerCache | None  # none in a decoder of one layer
+    last: LayerCache
 
 
 class PrefixCache(NamedTuple):
     """An encoded prompt: its keys and values, which of them may be seen, and the position that follows it."""
 
-    layers: tuple[LayerCache, ...]
+    caches: Caches
     mask: Bool[Array, "L"]
     next_position: Int[Array, ""]
-
-
-@struct.dataclass
-class Segments:
-    """Which example each token of a row belongs to, −1 for padding; the tokens of an example stand together.
-
-    None has more than `reach` tokens: keys further away are left out before they are masked.
-    """
-
-    number: Int[Array, "W"]
-    reach: int = struct.field(pytree_node=False)
 
 
 class DecoderLayer(nn.Module):
@@ -171,7 +162,9 @@ for the gradient of its layer, where that of all layers at once may begin with a
 class Decoder(nn.Module):
     """Causal language model with an explicit cache: `prefill` a prompt, then `extend` it or `decode` token by token.
 
-    With `remat` its backward passes keep less and compute more; values, gradients and parameters are the same.
+    The layers before the last are one layer with stacked parameters, scanned, so that a program does not grow with
+    depth; the last stands alone, for often only some of its tokens are answered.  With `remat` the backward passes keep
+    less and compute more; values, gradients and parameters are the same.
     """
 
     config: DecoderConfig
@@ -181,7 +174,9 @@ class Decoder(nn.Module):
         c = self.config
         layer = Rematerialised if self.remat else DecoderLayer
         self.embedding = Embed(c.vocab_size, c.hidden_size, embedding_init=nn.initializers.normal(0.02))
-        self.layers = [layer(c) for _ in range(c.num_layers)]
+        if c.num_layers > 1:
+            self.layers = layer(c)
+        self.last_layer = layer(c)
         self.norm = RMSNorm(c.norm_epsilon)
         if not c.tie_embedding:
             self.head = Dense(c.vocab_size, use_bias=False)
@@ -216,42 +211,38 @@ class Decoder(nn.Module):
         Returns:
           The hidden state of the last token and the cache that `extend` and `decode` read.
         """
-        x, rotation, caches = x[start:], self._rotation(positions[:, start:]), []
-        for i, layer in enumerate(self.layers):
-            before = None if known is None else jax.tree.map(lambda rows: rows[:, :start], known.layers[i])
-            last = i == len(self.layers) - 1  # the completion needs all of its keys, but only the last token's answer
-            x, cache = (layer.over_end if last else layer.over_prompt)(x, rotation, mask, before)
-            caches.append(cache)
-        return x[0], PrefixCache(tuple(caches), mask, _after(positions, mask))
+        x, rotation = x[start:], self._rotation(positions[:, start:])
+        old: Any = Caches(None, None) if known is None else known.caches  # type: ignore[arg-type]
+        before = jax.tree.map(lambda rows: rows[..., :start, :], old)
+        each = lambda layer, y, rows: layer.over_prompt(y, rotation, mask, rows)
+        x, layers = self._scan(each, x, before.layers)
+        # the completion needs all keys of the last layer, but only the last token's answer
+        x, last = self.last_layer.over_end(x, rotation, mask, before.last)
+        return x[0], PrefixCache(Caches(layers, last), mask, _after(positions, mask))
 
     def states(
         self, x: Float[Array, "L D"], positions: Int[Array, "3 L"], mask: Bool[Array, "L"]
     ) -> tuple[Float[Array, "L D"], PrefixCache]:
         """As `prefill`, with the hidden states of all tokens."""
         rotation = self._rotation(positions)
-        caches = []
-        for layer in self.layers:
-            x, cache = layer.over_prompt(x, rotation, mask)
-            caches.append(cache)
-        return x, PrefixCache(tuple(caches), mask, _after(positions, mask))
+        each = lambda layer, y: layer.over_prompt(y, rotation, mask)
+        x, layers = self._scan(each, x)
+        x, last = each(self.last_layer, x)
+        return x, PrefixCache(Caches(layers, last), mask, _after(positions, mask))
 
     def extend(self, tokens: Int[Array, "*g T"], prefix: PrefixCache) -> Float[Array, "*g T D"]:
         """Hidden states of a completion, or of a group, under the prompt, all at once (the learner's forward pass)."""
         t = tokens.shape[-1]
         x = self.embed(tokens)
         rotation = self._rotation(jnp.broadcast_to(prefix.next_position + jnp.arange(t), (3, t)))
-        for layer, past in zip(self.layers, prefix.layers, strict=True):
-            x = layer.over_completion(x, rotation, past, prefix.mask)
-        return x
+        return self._after_prefix(x, rotation, prefix)
 
     def extend_embedded(
         self, x: Float[Array, "T D"], exists: Bool[Array, "T"], prefix: PrefixCache
     ) -> Float[Array, "T D"]:
         """As `extend`, for embedded tokens of one sequence; those that do not exist advance no position."""
         rotation = self._rotation(_text_positions(prefix.next_position, exists))
-        for layer, past in zip(self.layers, prefix.layers, strict=True):
-            x = layer.over_completion(x, rotation, past, prefix.mask, exists)
-        return x
+        return self._after_prefix(x, rotation, prefix, exists)
 
     def packed_states(
         self,
@@ -269,24 +260,18 @@ class Decoder(nn.Module):
           places: whose states are wanted.
         """
         rotation = self._rotation(positions)
-        for layer in self.layers[:-1]:
-            x = layer.over_row(x, rotation, segments)
-        return self.layers[-1].over_places(x, rotation, segments, places)
+        x, _ = self._scan(lambda layer, y: (layer.over_row(y, rotation, segments), None), x)
+        return self.last_layer.over_places(x, rotation, segments, places)
 
     def decode(
-        self, token: Int[Array, ""], t: Int[Array, ""], prefix: PrefixCache, caches: tuple[LayerCache, ...]
-    ) -> tuple[Float[Array, "D"], tuple[LayerCache, ...]]:
+        self, token: Int[Array, ""], t: Int[Array, ""], prefix: PrefixCache, caches: Caches
+    ) -> tuple[Float[Array, "D"], Caches]:
         """Hidden state of completion token t, and the caches with its row written (the sampler's forward pass)."""
         x = self.embed(token[None])
         rotation = self._rotation(jnp.broadcast_to(prefix.next_position + t, (3, 1)))
-        written = []
-        for layer, past, cache in zip(self.layers, prefix.layers, caches, strict=True):
-            q, row = layer.project(x, rotation)
-            cache = LayerCache(_write_row(cache.k, row.k, t), _write_row(cache.v, row.v, t))
-            seen = jnp.arange(cache.k.shape[1]) <= t
-            x = layer.finish(x, attend(q, [KeySource(past.k, past.v, prefix.mask), KeySource(cache.k, cache.v, seen)]))
-            written.append(cache)
-        return x[0], tuple(written)
+        seen = jnp.arange(caches.last.k.shape[-2]) <= t
+        x, caches = self._append(x, rotation, t, prefix, caches, seen)
+        return x[0], caches
 
     def advance(
         self,
@@ -294,9 +279,9 @@ class Decoder(nn.Module):
         exists: Bool[Array, "n"],
         t: Int[Array, ""],
         prefix: PrefixCache,
-        caches: tuple[LayerCache, ...],
+        caches: Caches,
         seen: Bool[Array, "T"],
-    ) -> tuple[Float[Array, "n D"], tuple[LayerCache, ...], Bool[Array, "T"]]:
+    ) -> tuple[Float[Array, "n D"], Caches, Bool[Array, "T"]]:
         """Append n embedded tokens at row t of the caches; those that do not exist are never attended to.
 
         Args:
@@ -312,57 +297,53 @@ class Decoder(nn.Module):
         """
         n, rows = x.shape[0], seen.shape[0]
         rotation = self._rotation(_text_positions(prefix.next_position + jnp.sum(seen), exists))
-        seen = _write_row(seen[:, None], exists[:, None], t)[:, 0]
+        seen = _write_rows(seen[None, None, :, None], exists[None, :, None], 0, t)[0, 0, :, 0]
         mask = seen & (jnp.arange(rows) <= t + jnp.arange(n)[:, None])
-        written = []
-        for layer, past, cache in zip(self.layers, prefix.layers, caches, strict=True):
-            q, own = layer.project(x, rotation)
-            cache = LayerCache(_write_row(cache.k, own.k, t), _write_row(cache.v, own.v, t))
-            x = layer.finish(x, attend(q, [KeySource(past.k, past.v, prefix.mask), KeySource(cache.k, cache.v, mask)]))
-            written.append(cache)
-        return x, tuple(written), seen
+        return *self._append(x, rotation, t, prefix, caches, mask), seen
+
+    def _scan(self, each: Callable[..., tuple[Any, Any]], x: Any, *of_layers: Any) -> tuple[Any, Any]:
+        """x through all layers before the last, each(layer, x, its part of `of_layers`) → x, what is kept of it."""
+        if self.config.num_layers == 1:
+            return x, None
+        return scan_layers(each, self.config.num_layers - 1)(self.layers, x, *of_layers)
+
+    def _after_prefix(
+        self, x: Float[Array, "*g T D"], rotation: Rotation, prefix: PrefixCache, exists: Bool[Array, "T"] | None = None
+    ) -> Float[Array, "*g T D"]:
+        """A completion through all layers."""
+        each = lambda layer, y, past: (layer.over_completion(y, rotation, past, prefix.mask, exists), None)
+        x, _ = self._scan(each, x, prefix.caches.layers)
+        return each(self.last_layer, x, prefix.caches.last)[0]
+
+    def _append(
+        self,
+        x: Float[Array, "n D"],
+        rotation: Rotation,
+        t: Int[Array, ""],
+        prefix: PrefixCache,
+        caches: Caches,
+        seen: Bool[Array, "*n T"],
+    ) -> tuple[Float[Array, "n D"], Caches]:
+        """Tokens through all layers, their keys and values written from row t on."""
+
+        def each(layer: DecoderLayer, carry: Any, past: LayerCache, stack: LayerCache, i: Any) -> Any:
+            q, row = layer.project(carry, rotation)
+            stack = jax.tree.map(lambda rows, new: _write_rows(rows, new, i, t), stack, row)
+            own = _layer_of(stack, i)
+            keys = [KeySource(past.k, past.v, prefix.mask), KeySource(own.k, own.v, seen)]
+            return layer.finish(carry, attend(q, keys)), stack
+
+        def scanned(layer: DecoderLayer, carry: Any, i: Int[Array, ""]) -> tuple[Any, None]:
+            y, stack = carry  # the caches are carried and not mapped over, so that they are written in place
+            return each(layer, y, _layer_of(prefix.caches.layers, i), stack, i), None
+
+        (x, layers), _ = self._scan(scanned, (x, caches.layers), jnp.arange(self.config.num_layers - 1))
+        x, last = each(self.last_layer, x, prefix.caches.last, jax.tree.map(lambda rows: rows[None], caches.last), 0)
+        return x, Caches(layers, _layer_of(last, 0))
 
     def _rotation(self, positions: Int[Array, "3 T"]) -> Rotation:
         c = self.config
         return mrope(positions, c.head_dim, c.mrope_section, c.rope_theta)
-
-
-PREFILL_ROWS = 128
-"""Queries that a prompt answers at a time: each block skips the keys after it, and its scores stay in cache."""
-
-PREFILL_BLOCKS = 8
-"""Blocks of a prompt at most, for each is compiled by itself; eight compute an eighth more than what counts."""
-
-
-def attend_causally(q: Float[Array, "n KV R d"], cache: LayerCache, mask: Bool[Array, "L"]) -> Float[Array, "n hd"]:
-    """Attention of the last n of L prompt tokens over the tokens up to themselves that exist, in blocks of queries."""
-    before, blocks = cache.k.shape[1] - q.shape[0], []
-    rows = max(PREFILL_ROWS, -(-q.shape[0] // PREFILL_BLOCKS))
-    for begin in range(0, q.shape[0], rows):
-        end = min(begin + rows, q.shape[0])
-        keys = before + end
-        seen = jnp.tri(end - begin, keys, before + begin, dtype=bool) & mask[:keys]
-        blocks.append(attend(q[begin:end], [KeySource(cache.k[:, :keys], cache.v[:, :keys], seen)]))
-    return jnp.concatenate(blocks)
-
-
-ROW_QUERIES = 64
-"""Queries that a row of examples answers at a time: few, for each block is given all keys within reach."""
-
-ROW_BLOCKS = 16
-"""Blocks of a row at most."""
-
-
-def attend_in_segments(q: Float[Array, "W KV R d"], cache: LayerCache, segments: Segments) -> Float[Array, "W hd"]:
-    """Attention of each token over those of its own segment up to itself, in blocks of queries."""
-    width, blocks = q.shape[0], []
-    rows = max(ROW_QUERIES, -(-width // ROW_BLOCKS))
-    for begin in range(0, width, rows):
-        end, first = min(begin + rows, width), max(0, begin + 1 - segments.reach)
-        causal = jnp.tri(end - begin, end - first, begin - first, dtype=bool)
-        seen = causal & (segments.number[begin:end, None] == segments.number[first:end])
-        blocks.append(attend(q[begin:end], [KeySource(cache.k[:, first:end], cache.v[:, first:end], seen)]))
-    return jnp.concatenate(blocks)
 
 
 def _joined(before: LayerCache | None, own: LayerCache) -> LayerCache:
@@ -382,16 +363,24 @@ def _after(positions: Int[Array, "3 L"], mask: Bool[Array, "L"]) -> Int[Array, "
     return jnp.max(jnp.where(mask, positions, -1)) + 1
 
 
+def _layer_of(stack: Any, i: int | Int[Array, ""]) -> LayerCache:
+    return jax.tree.map(lambda rows: jax.lax.dynamic_index_in_dim(rows, i, keepdims=False), stack)
+
+
 @custom_vmap
-def _write_row(cache: Array, row: Array, t: Array) -> Array:
-    """Rows from t on replaced; stays a slice update in place under `vmap`, where jax's own rule makes a scatter."""
-    return jax.lax.dynamic_update_slice_in_dim(cache, row, t, axis=cache.ndim - 2)
+def _write_rows(stack: Array, rows: Array, i: Array, t: Array) -> Array:
+    """stack [*n, layer, KV, T, d] with rows [*n, KV, m, d] of layer i replaced from t on; stays a slice update in place
+    under `vmap`, where jax's own rule makes a scatter."""
+    start: Any = (*(0,) * (stack.ndim - 4), i, 0, t, 0)
+    return jax.lax.dynamic_update_slice(stack, jnp.expand_dims(rows, -4), start)
 
 
-@_write_row.def_vmap
-def _write_row_batched(size: int, batched: list[bool], cache: Array, row: Array, t: Array) -> tuple[Array, bool]:
-    if batched[2]:
+@_write_rows.def_vmap
+def _write_rows_batched(
+    size: int, batched: list[bool], stack: Array, rows: Array, i: Array, t: Array
+) -> tuple[Array, bool]:
+    if batched[2] or batched[3]:
         raise ValueError("all rows of a decoding batch are written at the same index t: do not batch t")
-    cache = cache if batched[0] else jnp.broadcast_to(cache, (size, *cache.shape))
-    row = row if batched[1] else jnp.broadcast_to(row, (size, *row.shape))
-    return _write_row(cache, row, t), True
+    stack = stack if batched[0] else jnp.broadcast_to(stack, (size, *stack.shape))
+    rows = rows if batched[1] else jnp.broadcast_to(rows, (size, *rows.shape))
+    return _write_rows(stack, rows, i, t), True

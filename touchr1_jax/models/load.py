@@ -39,12 +39,13 @@ class WeightsError(ValueError):
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Checkpoint:
-    """Contents of a directory; `params` is the tree of `QwenVL`, `budget` the pixels that a picture may have."""
+    """Contents of `directory`; `params` is the tree of `QwenVL`, `budget` the pixels that a picture may have."""
 
     config: QwenConfig
     params: Params
     tokenizer: Tokenizer
     budget: PixelBudget
+    directory: Path
 
 
 def load_checkpoint(
@@ -77,7 +78,7 @@ def _read(directory: Path, dtype: jnp.dtype | type, progress: ReportBytes) -> Ch
     check_template(directory)
     budget = read_budget(directory, config.vision)
     params = load_params(directory, config, dtype, progress=progress)
-    return Checkpoint(config=config, params=params, tokenizer=tokenizer, budget=budget)
+    return Checkpoint(config=config, params=params, tokenizer=tokenizer, budget=budget, directory=directory)
 
 
 def check_ids(tokenizer: Tokenizer, config: QwenConfig) -> None:

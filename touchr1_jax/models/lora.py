@@ -1,60 +1,87 @@
 """Low-rank adapters as a function of parameters: a frozen base, and a small tree beside it that is trained.
 
-    y = x W + (α/r) (x A) B,   W [in, out] frozen, A [in, r], B [r, out] trained, B = 0 at first
+    y = x W + s (x A) B,   W [in, out] frozen, A [in, r], B [r, out] trained, B = 0 at first
 
-(Hu et al. 2021, arXiv 2106.09685, §4.1).  The base is never copied: `adapted` adds the second term to the chosen dense
-layers of any Linen module while it is applied.  `merge` gives the parameters that compute the same without it.
+(Hu et al. 2021, arXiv 2106.09685, §4.1).  Parameters of an adapted policy hold the factors under `adapters`, nested as
+the layers that they belong to, and the base is never changed: `adapted` adds the second term to dense layers of any
+Linen module while it is applied.  `merge` exports parameters that compute the same without it.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
-from typing import Any
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import flax.traverse_util
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jaxtyping import Array, Float
 
-from touchr1_jax.models.policy_fns import PolicyFns
+from touchr1_jax.models.stacked import ADAPTERS
+from touchr1_jax.models.vmappable_dense import linear
 from touchr1_jax.types import Params
+from touchr1_jax.validation import above, at_least
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LoraConfig:
-    """Which dense layers are adapted, and how: those named in `layers` inside one of `towers`.
+    """Which dense layers are adapted, and how.
 
     Raises:
-      ValueError: a rank below 1.
+      ValueError: a rank below 0, or one above 0 without targets.
     """
 
     rank: int = 16
+    """Width of the adapters; 0 leaves them out."""
     alpha: float = 32.0
-    layers: tuple[str, ...] = ("q_proj", "k_proj", "v_proj", "o_proj", "gate", "up", "down")
-    towers: tuple[str, ...] = ("decoder",)
+    """The change is multiplied by alpha / rank."""
+    rank_stabilised: bool = False
+    """Multiply by alpha / √rank instead (rsLoRA, arXiv 2312.03732), so that the rate need not fall with the rank."""
+    targets: tuple[str, ...] = ("q_proj", "k_proj", "v_proj", "o_proj", "gate", "up", "down")
+    """Layers of the decoder."""
+    vision_targets: tuple[str, ...] = ()
+    """Layers of the vision tower, of a released one qkv, proj, gate, up, down, merger_in or merger_out."""
 
     def __post_init__(self) -> None:
-        if self.rank < 1:
-            raise ValueError(f"rank is {self.rank}: must be at least 1; leave the adapters out for none")
+        at_least(self, 0, "rank")
+        above(self, 0, "alpha")
+        if self.rank and not self.towers:
+            raise ValueError("targets are (): must name a layer where rank is above 0; name one, or set rank 0")
 
     @property
     def scale(self) -> float:
-        """α/r."""
-        return self.alpha / self.rank
+        """s, α/r or α/√r."""
+        return self.alpha / (self.rank**0.5 if self.rank_stabilised else self.rank)
+
+    @property
+    def towers(self) -> dict[str, tuple[str, ...]]:
+        """Tower → its layers that are adapted."""
+        named = {"decoder": self.targets, "vision": self.vision_targets}
+        return {tower: layers for tower, layers in named.items() if layers}
 
 
-class Adapter(struct.PyTreeNode):
-    """The two factors of one layer's change."""
+class Adapter(NamedTuple):
+    """The two factors of one layer's change, or of a stack of layers."""
 
-    a: Float[Array, "inp r"]
-    b: Float[Array, "r out"]
+    a: Float[Array, "*layer inp r"]
+    b: Float[Array, "*layer r out"]
 
 
-Adapters = Any
-"""A tree of `Adapter`s, nested as the parameters of the layers that they belong to."""
+Adapters = Params
+"""Factors "a" and "b" of each adapted layer, nested as the parameters of the layers that they belong to."""
+
+
+def by_layer(adapters: Adapters) -> dict[tuple[str, ...], Adapter]:
+    """The adapter of every layer, by its path."""
+    flat = flax.traverse_util.flatten_dict(adapters)
+    return {path[:-1]: Adapter(x, flat[(*path[:-1], "b")]) for path, x in flat.items() if path[-1] == "a"}
+
+
+def nested(adapters: Mapping[tuple[str, ...], Adapter]) -> Adapters:
+    """Inverse of `by_layer`."""
+    return flax.traverse_util.unflatten_dict({path: found._asdict() for path, found in adapters.items()})
 
 
 def init_adapters(key: Array, base: Params, config: LoraConfig) -> Adapters:
@@ -69,67 +96,93 @@ def init_adapters(key: Array, base: Params, config: LoraConfig) -> Adapters:
       ValueError: a layer or tower that the base lacks.
     """
     shapes = {path: leaf.shape for path, leaf in _kernels(base, config)}
-    for field, position in (("layers", -1), ("towers", 0)):
-        found = {path[position] for path in shapes}
-        lacking = set(getattr(config, field)) - found
-        if lacking:
-            raise ValueError(f"{field} {sorted(lacking)} have no dense layer in the parameters; name others")
+    for tower, layers in config.towers.items():
+        if lacking := {*layers} - {path[-1] for path in shapes if path[0] == tower}:
+            raise ValueError(f"targets {sorted(lacking)} are no dense layers of {tower}; name others")
     keys = jax.random.split(key, len(shapes))
     fresh = {
         path: Adapter(
-            a=jax.random.uniform(k, (inp, config.rank), minval=-1, maxval=1) / np.sqrt(inp),
-            b=jnp.zeros((config.rank, out)),
+            a=jax.random.uniform(k, (*stack, inp, config.rank), minval=-1, maxval=1) / np.sqrt(inp),
+            b=jnp.zeros((*stack, config.rank, out)),
         )
-        for k, (path, (inp, out)) in zip(keys, shapes.items(), strict=True)
+        for k, (path, (*stack, inp, out)) in zip(keys, shapes.items(), strict=True)
     }
-    return flax.traverse_util.unflatten_dict(fresh)
+    return nested(fresh)
 
 
-def adapted(adapters: Adapters, config: LoraConfig) -> AbstractContextManager[None]:
-    """Within this context every dense layer that has an adapter computes x W + b + (α/r) (x A) B."""
-    by_path = flax.traverse_util.flatten_dict(adapters)
+def with_adapters(params: Params, config: LoraConfig, base: Params, seed: int) -> Params:
+    """Parameters whose adapters are fresh where they have none.
+
+    Args:
+      params: which may hold `adapters`.
+      config: which layers.
+      base: parameters of the adapted towers.
+      seed: of fresh adapters.
+    """
+    if ADAPTERS in params or not config.rank:
+        return params
+    return {**params, ADAPTERS: init_adapters(jax.random.fold_in(jax.random.key(seed), 1), base, config)}
+
+
+def of_decoder(params: Params) -> Params:
+    """The decoder and its adapters, of all parameters."""
+    found = {"decoder": params["decoder"]}
+    if "decoder" in params.get(ADAPTERS, {}):
+        found[ADAPTERS] = {"decoder": params[ADAPTERS]["decoder"]}
+    return found
+
+
+def adapted(scale: float) -> AbstractContextManager[None]:
+    """Within this context a dense layer with variables "a" and "b" in the collection `ADAPTERS` adds s (x A) B."""
 
     def add(call: Callable[..., Array], args: tuple[Any, ...], kwargs: dict[str, Any], context) -> Array:
-        y = call(*args, **kwargs)
-        path = context.module.path
-        if not isinstance(context.module, nn.Dense) or context.method_name != "__call__" or path not in by_path:
+        y, layer = call(*args, **kwargs), context.module
+        if not isinstance(layer, nn.Dense) or context.method_name != "__call__":
             return y
-        a, b = by_path[path].a.astype(y.dtype), by_path[path].b.astype(y.dtype)
-        return y + config.scale * (args[0].astype(y.dtype) @ a) @ b
+        if not layer.has_variable(ADAPTERS, "a"):
+            return y
+        factor: Callable[[str], Array] = lambda name: layer.get_variable(ADAPTERS, name).astype(y.dtype)
+        return y + scale * linear(linear(args[0].astype(y.dtype), factor("a")), factor("b"))
 
     return nn.intercept_methods(add)
 
 
 def merge(base: Params, adapters: Adapters, config: LoraConfig) -> Params:
-    """Parameters with the adapters in them, W + (α/r) A B, computed in float32 and kept in the type of W.
+    """Parameters with the adapters in them, W + s A B, computed in float32 and kept in the type of W.
+
+    A coarse type loses what moves a weight by less than half the distance to its neighbour: `kept_share` says how much.
 
     Raises:
       ValueError: adapters of layers that the base lacks.
     """
-    flat, by_path = (flax.traverse_util.flatten_dict(tree) for tree in (base, adapters))
-    strangers = ["/".join(path) for path in by_path if (*path, "kernel") not in flat]
+    flat, found = flax.traverse_util.flatten_dict(base), by_layer(adapters)
+    strangers = ["/".join(path) for path in found if (*path, "kernel") not in flat]
     if strangers:
         raise ValueError(f"adapters {strangers[:3]} belong to no layer of the base; merge them into their own")
-    for path, adapter in by_path.items():
+    for path, adapter in found.items():
         kernel = flat[(*path, "kernel")]
-        change = _change(adapter, config)
-        flat[(*path, "kernel")] = (kernel.astype(jnp.float32) + change).astype(kernel.dtype)
+        flat[(*path, "kernel")] = (kernel.astype(jnp.float32) + _change(adapter, config)).astype(kernel.dtype)
     return flax.traverse_util.unflatten_dict(flat)
+
+
+def exported(params: Params, config: LoraConfig) -> Params:
+    """All parameters with their adapters merged into them."""
+    whole = {name: tree for name, tree in params.items() if name != ADAPTERS}
+    return merge(whole, params[ADAPTERS], config) if ADAPTERS in params else whole
 
 
 def kept_share(base: Params, merged: Params, adapters: Adapters, config: LoraConfig) -> float:
     """Share of the adapters' change Δ that merged weights keep, ⟨W' − W, Δ⟩ / ⟨Δ, Δ⟩ over all layers.
 
-    1 where nothing is lost; near 0 where the weights' type is too coarse: a weight that the change moves by less than
-    half the distance to its neighbour in that type stays where it is.  No change at all is kept whole.
+    1 where nothing is lost; near 0 where the weights' type is too coarse.  No change at all is kept whole.
 
     Args:
       base, adapters, config: as `merge` took them.
       merged: what it gave.
     """
-    before, after, by_path = (flax.traverse_util.flatten_dict(tree) for tree in (base, merged, adapters))
+    before, after = (flax.traverse_util.flatten_dict(tree) for tree in (base, merged))
     along, whole = 0.0, 0.0
-    for path, adapter in by_path.items():
+    for path, adapter in by_layer(adapters).items():
         w, v = (tree[(*path, "kernel")].astype(jnp.float32) for tree in (before, after))
         change = _change(adapter, config)
         along += float(jnp.vdot(v - w, change))
@@ -138,58 +191,13 @@ def kept_share(base: Params, merged: Params, adapters: Adapters, config: LoraCon
 
 
 def _change(adapter: Adapter, config: LoraConfig) -> Array:
-    """Change that an adapter adds to its kernel, (α/r) A B, in float32."""
+    """Change that an adapter adds to its kernel, s A B, in float32."""
     return config.scale * adapter.a @ adapter.b
-
-
-class Trainable(struct.PyTreeNode):
-    """Trained parameters of an adapted policy: adapters, and towers trained in full, such as the tactile encoder.
-
-    The reference policy of GRPO is the base itself: fresh adapters, whose B is 0, and no towers.
-    """
-
-    adapters: Adapters
-    towers: Params
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class LoraFns(PolicyFns):
-    """Policy functions whose parameters are a `Trainable`; the base is part of its context and gets no gradient.
-
-    A base of gigabytes must reach a compiled step as an argument and not as a constant: build the step inside the
-    compiled function, as `over_base` does.
-    """
-
-    base: Params
-    lora: LoraConfig
-
-    def with_context(self, change: Callable[[Params], Params]) -> "LoraFns":
-        """The functions on a changed base."""
-        return dataclasses.replace(self, base=change(self.base))
-
-    def _apply(self, params: Trainable, method: Callable[..., Any], *args: Any) -> Any:
-        with adapted(params.adapters, self.lora):
-            return self.module.apply({"params": {**self.base, **params.towers}}, *args, method=method)
-
-
-def adapt(fns: PolicyFns, base: Params, config: LoraConfig) -> LoraFns:
-    """The same functions on a frozen base."""
-    fields = {f.name: getattr(fns, f.name) for f in dataclasses.fields(PolicyFns)}
-    return LoraFns(**fields, base=base, lora=config)
-
-
-def over_base(fns: LoraFns, make_step: Callable[[LoraFns], Callable[..., Any]]) -> Callable[..., Any]:
-    """Compile (base, state, …) → result from a maker of the step (state, …) → result; the state is donated."""
-
-    def step(base: Params, state: Any, *rest: Any) -> Any:
-        return make_step(dataclasses.replace(fns, base=base))(state, *rest)
-
-    return jax.jit(step, donate_argnums=1)
 
 
 def _kernels(base: Params, config: LoraConfig) -> Iterator[tuple[tuple[str, ...], Any]]:
     """Path and kernel of every dense layer that the config names."""
     for path, leaf in flax.traverse_util.flatten_dict(base).items():
         *modules, name = path
-        if name == "kernel" and modules[0] in config.towers and modules[-1] in config.layers:
+        if name == "kernel" and modules[-1] in config.towers.get(modules[0], ()):
             yield tuple(modules), leaf

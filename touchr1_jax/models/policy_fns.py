@@ -4,12 +4,16 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from touchr1_jax.models.lm import LayerCache, PrefixCache
+from touchr1_jax.models.blocked_attention import LayerCache
+from touchr1_jax.models.lm import Caches, PrefixCache
+from touchr1_jax.models.lora import LoraConfig, adapted
 from touchr1_jax.models.policy import Features, Policy, Row, Slots
+from touchr1_jax.models.stacked import ADAPTERS
 from touchr1_jax.text.template import PromptLayout
 from touchr1_jax.text.tokenizer import Tokenizer
 from touchr1_jax.types import Params, TouchBatch
@@ -26,6 +30,9 @@ class PolicyFns:
       end_ids: ids that end a completion.
       pad_id: id that follows the end.
       cache_dtype: type of keys and values, that of the decoder's parameters.
+      lora: which layers have adapters where parameters hold any, and their scale.
+      base: frozen parameters, beside those that are an argument.  One of gigabytes must reach a compiled step as an
+        argument and not as a constant: build the step inside the compiled function, as `over_base` does.
     """
 
     module: Policy
@@ -34,6 +41,8 @@ class PolicyFns:
     end_ids: tuple[int, ...]
     pad_id: int
     cache_dtype: jnp.dtype = jnp.dtype(jnp.float32)
+    lora: LoraConfig = LoraConfig(rank=0)
+    base: Params = dataclasses.field(default_factory=dict)
 
     @classmethod
     def for_layout(
@@ -59,9 +68,8 @@ class PolicyFns:
         return self._apply(params, Policy.encode_streams, *stream)
 
     def with_context(self, change: Callable[[Params], Params]) -> "PolicyFns":
-        """The functions with parameters that are no argument changed; this one has none."""
-        del change
-        return self
+        """The functions on a changed base."""
+        return dataclasses.replace(self, base=change(self.base)) if self.base else self
 
     @property
     def touch_start(self) -> int:
@@ -88,8 +96,8 @@ class PolicyFns:
         return self._apply(params, Policy.prefill, features, ids, mask, self.slots, banned, known, start)
 
     def decode(
-        self, params: Params, token: Array, t: Array, prefix: PrefixCache, caches: tuple[LayerCache, ...]
-    ) -> tuple[Float[Array, "V"], tuple[LayerCache, ...]]:
+        self, params: Params, token: Array, t: Array, prefix: PrefixCache, caches: Caches
+    ) -> tuple[Float[Array, "V"], Caches]:
         """One token step of one rollout."""
         return self._apply(params, Policy.decode, token, t, prefix, caches, jnp.asarray(self.banned))
 
@@ -133,11 +141,25 @@ class PolicyFns:
         """Scores of the token that each hidden state predicts, banned ids out of reach."""
         return self._apply(params, Policy.logits, states, jnp.asarray(self.banned))
 
-    def empty_cache(self, length: int) -> tuple[LayerCache, ...]:
+    def empty_cache(self, length: int) -> Caches:
         """Caches of one completion of at most `length` tokens."""
         c = self.module.config.decoder
-        zeros = jnp.zeros((c.num_kv_heads, length, c.head_dim), self.cache_dtype)
-        return tuple(LayerCache(zeros, zeros) for _ in range(c.num_layers))
+        zeros = lambda *n: LayerCache(*(jnp.zeros((*n, c.num_kv_heads, length, c.head_dim), self.cache_dtype),) * 2)
+        return Caches(zeros(c.num_layers - 1) if c.num_layers > 1 else None, zeros())
 
     def _apply(self, params: Params, method: Callable[..., Any], *args: Any) -> Any:
-        return self.module.apply({"params": params}, *args, method=method)
+        whole = {**self.base, **params}
+        adapters = whole.pop(ADAPTERS, None)
+        if adapters is None:
+            return self.module.apply({"params": whole}, *args, method=method)
+        with adapted(self.lora.scale):
+            return self.module.apply({"params": whole, ADAPTERS: adapters}, *args, method=method)
+
+
+def over_base(fns: PolicyFns, make_step: Callable[[PolicyFns], Callable[..., Any]]) -> Callable[..., Any]:
+    """Compile (base, state, …) → result from a maker of the step (state, …) → result; the state is donated."""
+
+    def step(base: Params, state: Any, *rest: Any) -> Any:
+        return make_step(dataclasses.replace(fns, base=base))(state, *rest)
+
+    return jax.jit(step, donate_argnums=1)

@@ -27,7 +27,8 @@ from touchr1_jax.models.load import TOKENIZER_FILE, WeightsError
 from touchr1_jax.models.qwen.config import CONFIG_FILE
 from touchr1_jax.models.qwen.safetensors import read_header, read_tensor, write_file
 from touchr1_jax.models.qwen.weights import SINGLE
-from touchr1_jax.models.touch_policy import ModelConfig, TouchPolicy, assemble_policy, touch_shapes
+from touchr1_jax.models.stacked import restacked, unstacked
+from touchr1_jax.models.touch_policy import ModelConfig, TouchConfig, TouchPolicy, assemble_policy, touch_shapes
 from touchr1_jax.text.language import Language
 from touchr1_jax.text.template import QUESTIONS
 from touchr1_jax.text.tokenizer import word_library, word_tokenizer
@@ -56,11 +57,13 @@ class PolicyInput:
     Attributes:
       rejected: names of the quality flags whose frames are left out.
       choose: rule by which the frames of a sequence are chosen (`sensors_io.selection.choose_frames`).
+      show: camera pictures, or the fields beside them, as images (`sensors_io.selection.field_images`).
       force, view: whether a force was measured, and whether objects had a picture.
     """
 
     rejected: tuple[str, ...] = ()
     choose: str = "auto"
+    show: str = "pictures"
     force: bool = True
     view: bool = True
 
@@ -81,10 +84,15 @@ class SavedPolicy:
         return tuple(sensor.name for sensor in self.policy.language.sensors)
 
     @property
-    def model(self) -> ModelConfig:
+    def model(self) -> TouchConfig:
         """Sizes."""
-        assert isinstance(self.policy.model, ModelConfig)
         return self.policy.model
+
+    @property
+    def view_px(self) -> int:
+        """Rows and columns of the object's picture."""
+        model: Any = self.policy.model
+        return model.vision.image_px if isinstance(model, ModelConfig) else model.view_px
 
 
 def save_policy(folder: Path, saved: SavedPolicy, *, precision: Precision = "float32", card: str = "") -> None:
@@ -99,7 +107,7 @@ def save_policy(folder: Path, saved: SavedPolicy, *, precision: Precision = "flo
     Raises:
       PolicyError: the folder exists and holds something else.
     """
-    if folder.exists() and _format(folder) != FORMAT and (not folder.is_dir() or any(folder.iterdir())):
+    if folder.exists() and format_of(folder) != FORMAT and (not folder.is_dir() or any(folder.iterdir())):
         raise PolicyError(f"folder is {folder}: it exists and is no policy; choose a new one")
     unfinished, old = (folder.with_name(f".{folder.name}.{os.getpid()}{end}") for end in ("", ".old"))
     shutil.rmtree(unfinished, ignore_errors=True)
@@ -109,8 +117,7 @@ def save_policy(folder: Path, saved: SavedPolicy, *, precision: Precision = "flo
         words = [piece.decode().strip() for piece in saved.policy.tokenizer.pieces if piece]
         word_library(words).save(str(unfinished / TOKENIZER_FILE))
         (unfinished / CARD).write_text(card or default_card(saved, precision), encoding="utf-8")
-        config = json.dumps(_config(saved, precision, unfinished), indent=2, ensure_ascii=False)
-        (unfinished / CONFIG_FILE).write_text(config + "\n", encoding="utf-8")
+        (unfinished / CONFIG_FILE).write_text(seal(_config(saved, precision, unfinished)), encoding="utf-8")
         if folder.exists():
             folder.rename(old)
         unfinished.rename(folder)
@@ -125,14 +132,15 @@ def read_policy(folder: Path) -> SavedPolicy:
     Raises:
       PolicyError: no such folder, a folder of something else, of a newer version, or damaged.
     """
-    config = _read_config(folder)
+    config = read_sealed(folder, FORMAT, VERSION)
     try:
         for name in (SINGLE, TOKENIZER_FILE):
             if not (folder / name).is_file() or _sha256((folder / name).read_bytes()) != config["files"][name]:
                 raise PolicyError(f"policy is {folder}: {name} is missing or damaged; copy the folder again")
         notes = {**config["notes"]}
-        model, language = _rebuilt(ModelConfig, config["model"]), _rebuilt(Language, config["language"])
-        reads, questions = _rebuilt(PolicyInput, config["input"]), dict(config["questions"])
+        model, language = rebuilt(ModelConfig, config["model"]), rebuilt(Language, config["language"])
+        known = {"show": PolicyInput.show, **config["input"]}  # those saved before it could be chosen see pictures
+        reads, questions = rebuilt(PolicyInput, known), dict(config["questions"])
         vocabulary = json.loads((folder / TOKENIZER_FILE).read_text(encoding="utf-8"))["model"]["vocab"]
         words = sorted(vocabulary, key=vocabulary.__getitem__)[len(word_library(()).get_vocab()) :]
         policy = assemble_policy(model, language, word_tokenizer(words), questions)
@@ -215,11 +223,31 @@ def _config(saved: SavedPolicy, precision: Precision, folder: Path) -> dict[str,
         "notes": dict(saved.notes),
         "files": {name: _sha256((folder / name).read_bytes()) for name in (SINGLE, TOKENIZER_FILE)},
     }
-    return fields | {CHECKSUM: _digest(fields)}
+    return fields
 
 
-def _read_config(folder: Path) -> dict[str, Any]:
-    """Contents of `config.json`, held against their checksum."""
+def seal(fields: Mapping[str, Any]) -> str:
+    """The text of a `config.json` with the checksum of its fields."""
+    plain = json.loads(json.dumps(fields))
+    return json.dumps(plain | {CHECKSUM: _digest(plain)}, indent=2, ensure_ascii=False) + "\n"
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of a file."""
+    return _sha256(path.read_bytes())
+
+
+def read_sealed(folder: Path, wanted: str, newest: int) -> dict[str, Any]:
+    """Contents of a `config.json` that `seal` wrote, held against its checksum.
+
+    Args:
+      folder: of the policy.
+      wanted: its format.
+      newest: the version that is read.
+
+    Raises:
+      PolicyError: no such file, another format or version, or changed.
+    """
     where = f"policy is {folder}"
     if not (folder / CONFIG_FILE).is_file():
         what = f"holds no {CONFIG_FILE}" if folder.is_dir() else "no such folder"
@@ -229,19 +257,19 @@ def _read_config(folder: Path) -> dict[str, Any]:
         kind, version = found.get("model_type"), found.get("version")
     except (ValueError, AttributeError, RecursionError) as error:
         raise PolicyError(f"{where}: {CONFIG_FILE} is damaged ({error}); copy the folder again") from error
-    if kind != FORMAT:
+    if kind != wanted:
         raise PolicyError(
-            f"{where}: model_type in {CONFIG_FILE} is {kind!r}: must be {FORMAT!r}; a released Qwen2.5-VL is read by "
+            f"{where}: model_type in {CONFIG_FILE} is {kind!r}: must be {wanted!r}; a released Qwen2.5-VL is read by "
             "`experiments touch_r1 --weights`"
         )
-    if version != VERSION:
-        raise PolicyError(f"{where}: version is {version}: this code reads {VERSION}; update touchr1-jax")
+    if version != newest:
+        raise PolicyError(f"{where}: version is {version}: this code reads {newest}; update touchr1-jax")
     if found.pop(CHECKSUM, None) != _digest(found):
         raise PolicyError(f"{where}: {CONFIG_FILE} was changed after it was written; copy the folder again")
     return found
 
 
-def _format(folder: Path) -> str | None:
+def format_of(folder: Path) -> str | None:
     """The `model_type` of a folder, if it has one."""
     try:
         return json.loads((folder / CONFIG_FILE).read_text(encoding="utf-8"))["model_type"]
@@ -251,7 +279,8 @@ def _format(folder: Path) -> str | None:
 
 def _stored(params: Params, precision: Precision) -> dict[str, np.ndarray]:
     """Tensors as they are written, by dotted names."""
-    flat = {name: np.asarray(x, np.float32) for name, x in traverse_util.flatten_dict(params, sep=".").items()}
+    by_name = unstacked(traverse_util.flatten_dict(params, sep="."))
+    flat = {name: np.asarray(x, np.float32) for name, x in by_name.items()}
     if precision != "int8":
         return {name: x.astype(precision) for name, x in flat.items()}
     stored: dict[str, np.ndarray] = {}
@@ -269,12 +298,12 @@ def _read_params(folder: Path) -> dict[str, np.ndarray]:
     try:
         found = {name: read_tensor(entry) for name, entry in read_header(folder / SINGLE).items()}
         params = {name: x.astype(np.float32) for name, x in found.items() if not name.endswith(SCALE)}
-        return {name: x * found[name + SCALE] if name + SCALE in found else x for name, x in params.items()}
+        return restacked({name: x * found.get(name + SCALE, np.float32(1)) for name, x in params.items()})
     except (ValueError, LookupError) as error:
         raise PolicyError(f"policy is {folder}: {error}") from error
 
 
-def _rebuilt(kind: Any, value: Any) -> Any:
+def rebuilt(kind: Any, value: Any) -> Any:
     """A value of a type, which may be a dataclass, a tuple of types or a plain value, from its JSON form.
 
     Raises:
@@ -285,11 +314,11 @@ def _rebuilt(kind: Any, value: Any) -> Any:
         names = {field.name for field in dataclasses.fields(kind)}
         if names != value.keys():
             raise ValueError(f"{getattr(kind, '__name__', kind)} differs in {sorted(names ^ value.keys())}")
-        return kind(**{name: _rebuilt(hints[name], value[name]) for name in names})  # type: ignore[operator]
+        return kind(**{name: rebuilt(hints[name], value[name]) for name in names})  # type: ignore[operator]
     if typing.get_origin(kind) is tuple:
         inner = typing.get_args(kind)
         each = [inner[0]] * len(value) if inner[-1] is Ellipsis else inner
-        return tuple(_rebuilt(of, item) for of, item in zip(each, value, strict=True))
+        return tuple(rebuilt(of, item) for of, item in zip(each, value, strict=True))
     plain = typing.get_origin(kind) in (None, Literal, typing.Union, types.UnionType)
     return value if plain else list(value)
 

@@ -7,7 +7,7 @@ params = policy.init(seed, batch)
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from jaxtyping import Array, Int
 
 from touchr1_jax.models.layers import SizeError, check_sizes
 from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.models.lora import LoraConfig
 from touchr1_jax.models.policy import Policy, PolicyConfig, init_policy
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.tactile_vit import TactileViTConfig
@@ -160,6 +161,14 @@ def assemble_policy(
         fns=PolicyFns.for_layout(Policy(config), layout, tokenizer),
         parser=compile_parser(language, tokenizer),
     )
+
+
+P = TypeVar("P", bound=TouchPolicy)
+
+
+def with_lora(policy: P, lora: LoraConfig) -> P:
+    """The policy whose stages train adapters; rank 0 leaves it as it is."""
+    return dataclasses.replace(policy, fns=dataclasses.replace(policy.fns, lora=lora)) if lora.rank else policy
 
 
 def language_of(sensors: tuple[str, ...]) -> Language:

@@ -15,9 +15,10 @@ from flax import struct
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
-from touchr1_jax.models.lm import LayerCache, PrefixCache
+from touchr1_jax.models.lm import Caches, PrefixCache
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.policy_fns import PolicyFns
+from touchr1_jax.models.stacked import layer_by_layer
 from touchr1_jax.rl.losses import token_log_probs
 from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.types import Params, Parsed, Rollout, Target
@@ -55,7 +56,7 @@ class GreedyAnswers:
     parsed: Parsed
 
 
-DecodeFn = Callable[[Array, Array, PrefixCache, tuple[LayerCache, ...]], tuple[Array, tuple[LayerCache, ...]]]
+DecodeFn = Callable[[Array, Array, PrefixCache, Caches], tuple[Array, Caches]]
 """(token [], t [], prefix, caches) → (logits [V] of token t + 1, caches), for one rollout."""
 
 
@@ -106,12 +107,11 @@ def make_answer(
     of: dict[str, Any] = {"length": length, "end_ids": fns.end_ids, "pad_id": fns.pad_id, "constraint": constraint}
     draw = SampleConfig(group=1, greedy=True, **of)
 
-    @jax.jit
     def answer(params: Params, batch: GRPOBatch) -> GreedyAnswers:
         tokens = sample_group(fns, params, batch, jax.random.key(0), draw).tokens[:, 0]
         return GreedyAnswers(tokens=tokens, parsed=jax.vmap(parser)(tokens))
 
-    return answer
+    return jax.jit(answer, compiler_options=layer_by_layer(fns.cache_dtype))
 
 
 class _Loop(NamedTuple):
@@ -129,7 +129,7 @@ def sample(
     decode: DecodeFn,
     first: Float[Array, "P V"],
     prefix: PrefixCache,
-    empty: tuple[LayerCache, ...],
+    empty: Any,
     key: Array,
     config: SampleConfig,
 ) -> Rollout:

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.policy_fns import PolicyFns
+from touchr1_jax.models.stacked import layer_by_layer
 from touchr1_jax.models.tactile_vit import TactileViTConfig, statistics_of
 from touchr1_jax.types import Params, TouchBatch
 
@@ -44,7 +45,8 @@ def parts(touch: TouchBatch, rows: np.ndarray) -> Iterator[TouchBatch]:
 @functools.cache
 def encode_program(fns: PolicyFns, blind: bool) -> Any:
     """Compiled encoder, made once."""
-    return jax.jit(lambda params, batch: fns.encode(params, batch, blind=blind))
+    options = layer_by_layer(fns.cache_dtype)
+    return jax.jit(lambda params, batch: fns.encode(params, batch, blind=blind), compiler_options=options)
 
 
 def noise_bank(

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from touchr1_jax.models.lora import of_decoder
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.rewards import make_rewards, total_reward
@@ -93,7 +94,7 @@ def evaluate_policy(
     shown = [present]
     if alone and present.any() and s > 1:
         shown += [present & (np.arange(s) == i) for i in range(s)]
-    answer, decoder = answer or answer_program(policy), {"decoder": params["decoder"]}
+    answer, decoder = answer or answer_program(policy), of_decoder(params)
     rounds: list[tuple[np.ndarray, Callable[[GRPOBatch, int], Any]]]
     rounds = [(streams, lambda batch, block: answer(decoder, batch)) for streams in shown]
     if samples:

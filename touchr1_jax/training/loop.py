@@ -132,7 +132,6 @@ class Hooks:
       checkpoints: where state and batches are saved and restored from; `None` saves nothing.
       resumed: receives the first step that is computed, 0 or that of the checkpoint, before any step.
       stopping: asked after every step; once it is true the state is saved and returned as it is.
-      merged: receives the share of its adapters that a stage's merged weights keep (`lora.kept_share`).
       times: receives how long steps took and how long they waited for data.
       devices: where the steps run.
       sampled: receives (step, sample) where the step returns a sample; `None` asks for none.
@@ -142,7 +141,6 @@ class Hooks:
     checkpoints: Checkpoints | None = None
     resumed: Callable[[int], None] = lambda step: None
     stopping: Callable[[], bool] = lambda: False
-    merged: Callable[[float], None] = lambda kept: None
     times: LoopTime | None = None
     devices: SingleDevice = SingleDevice()
     sampled: Callable[[int, StepSample], None] | None = None

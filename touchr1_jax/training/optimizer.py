@@ -54,5 +54,6 @@ def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransfo
     schedule = optax.warmup_cosine_decay_schedule(
         0.0, config.peak, warmup, max(steps, warmup + 1), end_value=config.peak * config.final_share
     )
-    adamw = optax.adamw(schedule, b2=config.b2, weight_decay=config.weight_decay)
+    begun = lambda count: schedule(count + 1)  # the first step of a warm-up is not spent at rate 0
+    adamw = optax.adamw(begun, b2=config.b2, weight_decay=config.weight_decay)
     return skip_nonfinite(optax.chain(optax.clip_by_global_norm(config.max_grad_norm), adamw))

@@ -17,7 +17,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Int
 
-from touchr1_jax.models.lm import Segments
+from touchr1_jax.models.blocked_attention import Segments
 from touchr1_jax.models.policy import Features, Policy, Row, Slots, prompt_mask, prompt_positions
 from touchr1_jax.types import TouchBatch
 

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float
 
-from touchr1_jax.models.lora import LoraConfig, adapt
+from touchr1_jax.models.lora import of_decoder, with_adapters
 from touchr1_jax.models.policy_fns import PolicyFns
+from touchr1_jax.models.stacked import ADAPTERS, layer_by_layer
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.rewards import AnyReward, check_weights, total_reward
 from touchr1_jax.rewards.base import GROUP
@@ -26,7 +27,7 @@ from touchr1_jax.text.language import Language
 from touchr1_jax.text.template import LevelTokens
 from touchr1_jax.training.loop import SILENT, Batches, Hooks, LoopConfig, fit, peek
 from touchr1_jax.training.optimizer import falling_adamw
-from touchr1_jax.training.train_sft import fresh_adapters, merge_adapters
+from touchr1_jax.training.train_sft import joined
 from touchr1_jax.types import Params, Parsed, Target
 
 
@@ -40,12 +41,11 @@ def train_grpo(
     hooks: Hooks = SILENT,
     *,
     noise: Float[Array, "K S N D"],
-    lora: LoraConfig | None = None,
     seed: int = 0,
 ) -> Params:
     """Reinforce the decoder of a policy by GRPO; both encoders stay as they are, and the reference is where it starts.
 
-    Fresh adapters change nothing, so that the policy without them is the reference; they are merged in the end.
+    Of a policy with adapters they alone are trained, on from where SFT left them.
 
     Args:
       policy: its prompts and forward passes.
@@ -56,8 +56,7 @@ def train_grpo(
       loop: number of steps.
       hooks: log, checkpoints, devices.
       noise: encoded noise streams of the policy's encoder (`encoding.noise_bank`).
-      lora: adapters that are trained instead of the decoder's weights; `None` trains those.
-      seed: of rollouts and fresh adapters.
+      seed: of rollouts, and of adapters where there are none yet.
 
     Raises:
       ValueError: a first batch without touch, a stream whose touch does not reach the policy.
@@ -65,16 +64,18 @@ def train_grpo(
     constraint = policy.constraint if config.algorithm.constrained else None
     levels = None if config.algorithm.enumerated is None else policy.level_tokens
     gather = hooks.devices.gather_params
-    parts = (policy.fns, score, config, loop.steps, constraint, lora, gather, levels)
-    optimizer, step = grpo_program(*parts, sampled=hooks.sampled is not None)
-    decoder = {"decoder": params["decoder"]}
-    check_whole_batch(policy.fns, decoder, batches, config, hooks, noise, seed)
-    trained = decoder if lora is None else fresh_adapters(decoder, {}, lora, seed)
+    optimizer, step = grpo_program(
+        policy.fns, score, config, loop.steps, constraint, gather, levels, hooks.sampled is not None
+    )
+    whole = with_adapters(params, policy.fns.lora, params, seed)
+    start = of_decoder(whole)
+    check_whole_batch(policy.fns, start, batches, config, hooks, noise, seed)
+    base = {name: tree for name, tree in start.items() if policy.fns.lora.rank and name != ADAPTERS}
+    trained = {name: tree for name, tree in start.items() if name not in base}
     state = start_state(trained, optimizer, jax.random.key(seed), config)
-    constants = (FrozenInputs(reference=trained, noise=noise), *(() if lora is None else (decoder,)))
+    constants = FrozenInputs(reference=trained, noise=noise), base
     step, state, batches = hooks.devices.shard(step, state, batches, config.drawn, *constants)
-    found = hooks.devices.gather(fit(step, state, batches, loop, hooks).params)
-    return {**params, **(found if lora is None else merge_adapters(decoder, found, lora, hooks))}
+    return joined(whole, hooks.devices.gather(fit(step, state, batches, loop, hooks).params))
 
 
 def check_rewards(rewards: Mapping[str, AnyReward], weights: Mapping[str, float], language: Language) -> None:
@@ -110,29 +111,26 @@ def grpo_program(
     config: GRPOConfig,
     steps: int,
     constraint: Constraint | None = None,
-    lora: LoraConfig | None = None,
     gather: Callable[[Params], Params] = lambda params: params,
     levels: LevelTokens | None = None,
     sampled: bool = False,
 ) -> tuple[optax.GradientTransformation, Any]:
-    """Optimizer and compiled step, made once for all seeds; with adapters the frozen decoder is the last argument."""
+    """Optimizer and compiled step, made once for all seeds; frozen parameters under adapters are its last argument."""
     learning_rate = config.learning_rate * config.lr_scale
     updates = steps * config.algorithm.updates * config.algorithm.minibatches
     optimizer = falling_adamw(learning_rate, config.final_share, updates, config.max_grad_norm)
     make = functools.partial(make_grpo_step, gather=gather, levels=levels, sampled=sampled)
-    plain = make(fns, score, optimizer, config, constraint)
-    if lora is None:
-        return optimizer, plain
     # a jitted step inside another takes no options of the compiler: the outer one gets them
     inner = dataclasses.replace(config, lean_compilation=False)
 
     def step(
         state: GRPOState, batch: GRPOBatch, frozen: FrozenInputs, base: Params
     ) -> tuple[GRPOState, dict[str, Array]]:
-        adapted = adapt(fns, base, lora)
-        return make(adapted, score, optimizer, inner, constraint)(state, batch, frozen)
+        on_base = dataclasses.replace(fns, base=base)
+        return make(on_base, score, optimizer, inner, constraint)(state, batch, frozen)
 
-    return optimizer, jax.jit(step, donate_argnums=0, compiler_options=LEAN if config.lean_compilation else None)
+    options = {**layer_by_layer(fns.cache_dtype), **(LEAN if config.lean_compilation else {})}
+    return optimizer, jax.jit(step, donate_argnums=0, compiler_options=options)
 
 
 def check_whole_batch(

@@ -17,15 +17,16 @@ from jaxtyping import Array
 from touchr1_jax.models.active_policy import ActivePolicy
 from touchr1_jax.models.chunked_logits import MAX_LOGITS
 from touchr1_jax.models.layers import SizeError
-from touchr1_jax.models.lora import LoraConfig, Trainable, adapt, init_adapters, kept_share, merge
+from touchr1_jax.models.lora import of_decoder, with_adapters
 from touchr1_jax.models.policy_fns import PolicyFns
+from touchr1_jax.models.stacked import ADAPTERS, layer_by_layer
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.training.loop import SILENT, Batches, Hooks, LoopConfig, fit
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
 from touchr1_jax.training.packing import Packing
 from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
 from touchr1_jax.types import Params
-from touchr1_jax.validation import above, at_least, within
+from touchr1_jax.validation import at_least, within
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -44,10 +45,6 @@ class SFTConfig:
     """Logits that may exist at once; more tokens than that are scored in blocks."""
     pack: int = 0
     """Tokens of a row that several questions with their answers share; 0 pads each to the longest instead."""
-    lora_rank: int = 0
-    """Rank of adapters that are trained instead of the decoder's weights; 0 trains the weights."""
-    lora_alpha: float = 32.0
-    """The adapters' change is multiplied by lora_alpha / lora_rank."""
     remat: bool = False
     """Keep only matrix products of the decoder for the backward pass and compute the rest again: less memory."""
     curriculum: float = 0.0
@@ -55,19 +52,13 @@ class SFTConfig:
     optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=100.0)
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "steps", "pack", "lora_rank")
+        at_least(self, 0, "steps", "pack")
         at_least(self, 1, "batch_size", "questions", "save_every", "micro_contacts", "max_logits")
-        above(self, 0, "lora_alpha")
         within(self, 0, 1, "curriculum")
         if self.batch_size % self.micro_contacts:
             raise ValueError(
                 f"micro_contacts is {self.micro_contacts}: must divide batch_size = {self.batch_size}; change either"
             )
-
-    @property
-    def lora(self) -> LoraConfig | None:
-        """Adapters of the decoder, or none."""
-        return LoraConfig(rank=self.lora_rank, alpha=self.lora_alpha) if self.lora_rank else None
 
     def packing(self, devices: int) -> Packing | None:
         """Rows that the contacts of a micro-batch share on each of the devices; `None` pads.
@@ -98,7 +89,7 @@ def train_sft(
     decoder_only: bool = False,
     held_out: Callable[[Params], float] | None = None,
 ) -> Params:
-    """Train a policy on verified answers; adapters are merged into the weights in the end.
+    """Train a policy on verified answers: its adapters where `policy.fns.lora` names any, and the towers without them.
 
     Args:
       policy: its prompts, forward passes, and towers that no stage trains.
@@ -118,50 +109,39 @@ def train_sft(
     """
     if held_out is not None and hooks.checkpoints is None:
         raise ValueError("hooks.checkpoints is None: must keep the best where held_out is given; set it")
-    whole, params = params, {"decoder": params["decoder"]} if decoder_only else params
-    lora = config.lora
-    if policy.frozen and lora is None:
-        raise SizeError(
-            f"sft.lora_rank is 0: must be at least 1 where {' and '.join(policy.frozen)} stand still; raise it"
-        )
+    lora = policy.fns.lora
+    if policy.frozen and not lora.rank:
+        raise SizeError(f"lora.rank is 0: must be at least 1 where {' and '.join(policy.frozen)} stand still; raise it")
+    whole = with_adapters(params, lora, params, seed)
+    part = of_decoder(whole) if decoder_only else whole
+    stand_still = {*policy.frozen, *(lora.towers if lora.rank else ())}
+    frozen = {name: tree for name, tree in part.items() if name in stand_still}
     optimizer, step = sft_program(policy.fns, config, blind)
-    frozen_towers = () if lora is None else {*policy.frozen, *lora.towers}
-    frozen = {name: tree for name, tree in params.items() if name in frozen_towers}
-    towers = {name: tree for name, tree in params.items() if name not in frozen_towers}
-    trained = towers if lora is None else fresh_adapters(frozen, towers, lora, seed)
+    trained = {name: tree for name, tree in part.items() if name not in frozen}
     trained = jax.tree.map(jnp.copy, trained)  # a step takes over the buffers of its state
     state = SFTState(params=trained, opt_state=optimizer.init(trained), step=jnp.zeros((), jnp.int32))
     loop = LoopConfig(steps=config.steps, save_every=config.save_every)
-    constants = () if lora is None else (frozen,)
     devices = hooks.devices
-    step, state, batches = devices.shard(step, state, batches, config.batch_size, *constants)
+    step, state, batches = devices.shard(step, state, batches, config.batch_size, frozen)
 
-    def complete(state: SFTState, hooks: Hooks = SILENT) -> Params:
-        found = devices.gather(state.params)
-        return {**whole, **(found if lora is None else merge_adapters(frozen, found, lora, hooks) | found.towers)}
+    def complete(state: SFTState) -> Params:
+        return joined(whole, devices.gather(state.params))
 
     score = None if held_out is None else lambda state: held_out(complete(state))
     state = fit(step, state, batches, loop, hooks, held_out=score)
     best = hooks.checkpoints.best(state) if held_out is not None and hooks.checkpoints is not None else None
-    return complete(state if best is None else best.state, hooks)
+    return complete(state if best is None else best.state)
 
 
-def fresh_adapters(frozen: Params, towers: Params, lora: LoraConfig, seed: int) -> Trainable:
-    """Trained parameters where some towers are frozen: the adapters of those, and the other towers."""
-    adapters = init_adapters(jax.random.fold_in(jax.random.key(seed), 1), frozen, lora)
-    return Trainable(adapters=adapters, towers=towers)
-
-
-def merge_adapters(frozen: Params, trained: Trainable, lora: LoraConfig, hooks: Hooks) -> Params:
-    """The frozen towers with their adapters merged into them."""
-    merged = merge(frozen, trained.adapters, lora)
-    hooks.merged(kept_share(frozen, merged, trained.adapters, lora))
-    return merged
+def joined(whole: Params, trained: Params) -> Params:
+    """All parameters, those that were trained in their places, adapters tower by tower."""
+    adapters = {**whole.get(ADAPTERS, {}), **trained.get(ADAPTERS, {})}
+    return {**whole, **trained, **({ADAPTERS: adapters} if adapters else {})}
 
 
 @functools.cache
 def sft_program(fns: PolicyFns, config: SFTConfig, blind: bool) -> tuple[optax.GradientTransformation, Any]:
-    """Optimizer and compiled step, made once for all seeds; with adapters, (state, batch, frozen towers) → …"""
+    """Optimizer and compiled step (state, batch, frozen towers) → (state, metrics), made once for all seeds."""
     optimizer = make_optimizer(config.optimizer, config.steps)
     fns = dataclasses.replace(fns, module=fns.module.clone(remat=True)) if config.remat else fns
     make = functools.partial(
@@ -171,11 +151,8 @@ def sft_program(fns: PolicyFns, config: SFTConfig, blind: bool) -> tuple[optax.G
         max_logits=config.max_logits,
         micro_contacts=config.micro_contacts,
     )
-    if config.lora is None:
-        return optimizer, make(fns)
-    lora = config.lora
 
     def step(state: SFTState, batch: SFTBatch, frozen: Params) -> tuple[SFTState, dict[str, Array]]:
-        return make(adapt(fns, frozen, lora))(state, batch)
+        return make(dataclasses.replace(fns, base=frozen))(state, batch)
 
-    return optimizer, jax.jit(step, donate_argnums=0)
+    return optimizer, jax.jit(step, donate_argnums=0, compiler_options=layer_by_layer(fns.cache_dtype))

@@ -5,12 +5,14 @@ import dataclasses
 import jax.numpy as jnp
 import pytest
 
-from experiments.paper.released_policy import ReleasedModel, build_released_policy, instruction
 from experiments.paper.tiny_checkpoint import write_tiny
 from experiments.study.dataset import open_dataset
 from sensors_io.pipeline import ClipConfig
 from tests.experiments import tiny
 from touchr1_jax.models.load import load_checkpoint
+from touchr1_jax.models.lora import LoraConfig
+from touchr1_jax.models.released_policy import ReleasedModel, build_released_policy, instruction
+from touchr1_jax.models.touch_policy import with_lora
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 
 MODEL = ReleasedModel(
@@ -21,6 +23,9 @@ MODEL = ReleasedModel(
     view_px=16,
     dtype="float32",
 )
+
+
+LORA = LoraConfig(rank=2, alpha=4.0, vision_targets=("qkv", "merger_in"))
 
 
 @pytest.fixture(scope="session")
@@ -44,4 +49,4 @@ def streamed(records):
 
 @pytest.fixture(scope="session")
 def policy(checkpoint, streamed):
-    return build_released_policy(MODEL, checkpoint, streamed.clip.sensors)
+    return with_lora(build_released_policy(MODEL, checkpoint, streamed.clip.sensors), LORA)

@@ -1,37 +1,28 @@
-"""The policy on released weights: prompts, towers, batches of SFT, refused sizes; its files, and what merging keeps."""
+"""The policy on released weights: prompts, towers, batches of SFT, refused sizes; its files."""
 
 import dataclasses
+import shutil
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.core.loops import KEPT
-from experiments.paper.released_policy import (
-    TOUCH_FILE,
-    build_released_policy,
-    grpo_shape,
-    instruction,
-    longest_answer,
-    merged_shares,
-    plain_answers,
-    read_policy,
-    require_same,
-    write_policy,
-)
+from experiments.paper.released_policy import grpo_shape, require_same
 from experiments.paper.tiny_checkpoint import published_config
-from experiments.paper.touch_r1 import ARM, SMOKE
+from experiments.paper.touch_r1 import SMOKE
 from experiments.study.stages import StudySFT
-from experiments.study.study import BLIND
-from experiments.study.study import SFT as SFT_NAME
 from sensors_io.schema import SENSORS
 from tests.experiments import tiny
-from tests.experiments.paper.conftest import MODEL
+from tests.experiments.paper.conftest import LORA, MODEL
 from tests.touchr1_jax.text.vocabularies import character_level
+from touchr1_jax.models.adapted_folder import export_merged, read_adapted, save_adapted
 from touchr1_jax.models.layers import SizeError
 from touchr1_jax.models.load import Load, WeightsError, load_checkpoint
+from touchr1_jax.models.lora import with_adapters
 from touchr1_jax.models.qwen.config import parse_config, released
+from touchr1_jax.models.released_policy import build_released_policy, instruction, longest_answer, plain_answers
+from touchr1_jax.models.saved_policy import PolicyError, PolicyInput, SavedPolicy
 
 SFT = StudySFT(batch_size=3, questions=2, micro_contacts=1)
 
@@ -80,48 +71,85 @@ def test_a_config_is_read_as_it_was_written(size):
 
 
 @pytest.fixture(scope="module")
-def trained(policy, streamed):
-    """Parameters none of which is the checkpoint's any more."""
-    params = policy.init(0, tiny.one_batch(streamed))
+def saved(policy, streamed):
+    """A policy with loud adapters and a tactile encoder that is not the fresh one."""
     rng = np.random.default_rng(0)
-    return jax.tree.map(lambda x: x + jnp.asarray(rng.normal(0, 0.1, x.shape), x.dtype), params)
+    loud = lambda x: x + jnp.asarray(rng.normal(0, 0.1, x.shape), x.dtype)
+    params = policy.init(0, tiny.one_batch(streamed))
+    params = with_adapters(params, LORA, params, 0)
+    params |= {name: jax.tree.map(loud, params[name]) for name in ("adapters", "tactile", "tactile_out")}
+    return SavedPolicy(policy=policy, params=params, reads=PolicyInput(), notes={"name": "trial"})
 
 
 @pytest.fixture(scope="module")
-def folder(trained, weights, tmp_path_factory):
+def folder(saved, weights, tmp_path_factory):
     """Written in place of an older one."""
-    folder = tmp_path_factory.mktemp("run") / "weights" / "0"
+    folder = tmp_path_factory.mktemp("run") / "policies" / "0"
     folder.mkdir(parents=True)
     (folder / "left.json").write_text("{}")
-    write_policy(folder, weights, trained)
+    save_adapted(folder, saved, str(weights))
     return folder
 
 
-def test_the_folder_is_a_release(folder, weights, capsys):
-    assert Load(directory=folder, dtype="float32").run() == 0
-    assert "1 layers of 64" in capsys.readouterr().out
-    assert {path.name for path in folder.iterdir()} == {path.name for path in weights.iterdir()} | {TOUCH_FILE}
+def first_logits(policy, params, batch):
+    features = jax.tree.map(lambda x: x[0], policy.fns.encode(params, batch))
+    ids, mask = jnp.asarray(policy.layout.ids[0]), jnp.asarray(policy.layout.mask[0])
+    return np.asarray(policy.fns.prefill(params, features, ids, mask)[0])
+
+
+def test_a_written_policy_describes_itself(folder, saved):
+    """Parameters bit by bit, adapters of both towers among them, from the folder and the released weights alone."""
+    tensors = {"adapter_model.safetensors", "touch_encoder.safetensors"}
+    assert {path.name for path in folder.iterdir()} == {"README.md", "config.json", "adapter_config.json", *tensors}
     assert [path.name for path in folder.parent.iterdir()] == [folder.name]
+    found = read_adapted(folder)
+    assert jax.tree.all(jax.tree.map(np.array_equal, found.params, saved.params))
+    assert (found.policy.fns.lora, found.policy.model) == (LORA, saved.policy.model)
+    assert (found.reads, found.notes, found.sensors) == (saved.reads, saved.notes, saved.sensors)
 
 
-def test_what_was_written_gives_the_same_logits(folder, trained, policy, streamed):
-    """Of the whole policy from its folder, and of the released towers alone from the loader of releases."""
-    read = read_policy(folder, jnp.float32)
-    assert jax.tree.all(jax.tree.map(np.array_equal, read, trained))
-    again = load_checkpoint(folder, jnp.float32).params
-    batch, layout = tiny.one_batch(streamed), policy.layout
+def test_an_export_computes_the_same_from_the_released_format(folder, saved, streamed, tmp_path, capsys):
+    kept = export_merged(tmp_path / "merged", saved, jnp.dtype(jnp.float32))
+    assert kept == pytest.approx(1, abs=1e-5)
+    assert Load(directory=tmp_path / "merged", dtype="float32").run() == 0
+    assert "1 layers of 64" in capsys.readouterr().out
+    again, batch = load_checkpoint(tmp_path / "merged", jnp.float32).params, tiny.one_batch(streamed)
+    merged = {**saved.params, "vision": {"tower": again["vision"]}, "decoder": again["decoder"]}
+    del merged["adapters"]
+    ours, theirs = (first_logits(saved.policy, p, batch) for p in (saved.params, merged))
+    writable = ~saved.policy.tokenizer.banned
+    np.testing.assert_allclose(ours[writable], theirs[writable], atol=1e-5 * np.abs(theirs[writable]).max())
+    base = {name: x for name, x in saved.params.items() if name != "adapters"}
+    assert np.abs(first_logits(saved.policy, base, batch) - ours)[writable].max() > 0.01
+    with pytest.raises(PolicyError, match="it exists and is not empty"):
+        export_merged(tmp_path / "merged", saved, jnp.dtype(jnp.float32))
 
-    @jax.jit
-    def logits(params):
-        features = jax.tree.map(lambda x: x[0], policy.fns.encode(params, batch))
-        return policy.fns.prefill(params, features, jnp.asarray(layout.ids[0]), jnp.asarray(layout.mask[0]))[0]
 
-    ours = np.asarray(logits(trained))
-    assert np.isfinite(ours[~policy.tokenizer.banned]).all()
-    np.testing.assert_array_equal(logits(read), ours)
-    towers = {**trained, "vision": {"tower": again["vision"]}, "decoder": again["decoder"]}
-    np.testing.assert_array_equal(logits(towers), ours)
-    assert (np.asarray(logits({**trained, "decoder": policy.checkpoint.params["decoder"]})) != ours).any()
+@pytest.mark.parametrize(
+    ("file", "message"),
+    [
+        ("adapter_model.safetensors", r"adapter_model\.safetensors is missing or damaged; copy the folder again"),
+        ("config.json", "was changed after it was written"),
+    ],
+)
+def test_a_damaged_folder_is_named(folder, tmp_path, file, message):
+    shutil.copytree(folder, tmp_path / "copy")
+    content = (tmp_path / "copy" / file).read_bytes()
+    old, new = (b"qkv", b"pkv") if file == "config.json" else (b"lora_A", b"lora_a")
+    (tmp_path / "copy" / file).write_bytes(content.replace(old, new, 1))
+    with pytest.raises(PolicyError, match=message):
+        read_adapted(tmp_path / "copy")
+
+
+def test_released_weights_that_are_missing_or_others_are_named(saved, weights, tmp_path):
+    save_adapted(tmp_path / "policy", saved, "nowhere")
+    with pytest.raises(PolicyError, match=r"its released weights are not in .*nowhere; say where by --weights DIR"):
+        read_adapted(tmp_path / "policy")
+    assert read_adapted(tmp_path / "policy", weights).notes == saved.notes
+    shutil.copytree(weights, tmp_path / "other")
+    (tmp_path / "other" / "config.json").write_text((weights / "config.json").read_text() + " ")
+    with pytest.raises(PolicyError, match=r"config\.json in .*other are not what it was trained on"):
+        read_adapted(tmp_path / "policy", tmp_path / "other")
 
 
 @pytest.mark.parametrize("at", [0, 2**20 - 1, 3 * 2**20 - 1])
@@ -141,20 +169,7 @@ def test_weights_of_the_same_size_with_another_byte_at_either_end_are_refused(tm
         require_same(tmp_path, context)
 
 
-def test_what_merging_keeps_is_the_least_of_all_seeds(context):
-    shares = {"sft": (0.97, 0.95), f"grpo/{ARM}": (0.4, 0.99), "blind": (1.0, 1.0)}
-    for stage, of_seeds in shares.items():
-        for seed, share in enumerate(of_seeds):
-            context.save_stage(f"{KEPT}/{stage}/{seed}", share)
-    assert merged_shares(ARM, 2, context) == {SFT_NAME: 0.95, ARM: 0.4, BLIND: 1.0}
-
-
 def test_completions_must_have_room_for_an_answer(checkpoint):
     model = dataclasses.replace(MODEL, completion_tokens=20)
     with pytest.raises(SizeError, match=r"model\.completion_tokens is 20: the longest answer takes \d+ tokens"):
         build_released_policy(model, checkpoint, SENSORS)
-
-
-def test_a_release_alone_is_no_policy(weights):
-    with pytest.raises(FileNotFoundError, match=f"holds no {TOUCH_FILE}: must be a folder that `touch_r1` wrote"):
-        read_policy(weights, jnp.float32)

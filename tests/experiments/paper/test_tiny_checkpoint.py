@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.paper.released_policy import build_released_policy
 from experiments.paper.tiny_checkpoint import UNUSED_TOUCH, drawn_batch, empty_touch
 from sensors_io.schema import SENSORS
 from touchr1_jax.models.policy import Features, prompt_mask
+from touchr1_jax.models.released_policy import build_released_policy
 from touchr1_jax.text.oracle import read
 
 

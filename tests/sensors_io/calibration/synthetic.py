@@ -11,7 +11,11 @@ BLUR_MM = 0.18  # of coating and lens
 
 
 def press_ball(
-    touches: np.ndarray, radius_mm: float = 3.0, mm_per_px: float = 0.15, shape: tuple[int, int] = (80, 106)
+    touches: np.ndarray,
+    radius_mm: float = 3.0,
+    mm_per_px: float = 0.15,
+    shape: tuple[int, int] = (80, 106),
+    blur_mm: float = BLUR_MM,
 ) -> BallPresses:
     """Pictures of touches [P, 3] in px: I = GREY (1 + fade lamp·n), blurred, and noise of one level."""
     rng = np.random.default_rng(5)
@@ -22,7 +26,7 @@ def press_ball(
         _, d_x, d_y = indentation((x - at_x) * mm_per_px, (y - at_y) * mm_per_px, contact * mm_per_px, radius_mm)
         up = 1 / np.sqrt(1 + d_x**2 + d_y**2)
         shade = 0.8 * fade * (LAMPS[:, 0] * (d_x * up)[..., None] + LAMPS[:, 1] * (d_y * up)[..., None])
-        shade = ndimage.gaussian_filter(shade, (BLUR_MM / mm_per_px, BLUR_MM / mm_per_px, 0))
+        shade = ndimage.gaussian_filter(shade, (blur_mm / mm_per_px, blur_mm / mm_per_px, 0))
         pictures.append(GREY * (1 + shade) + rng.standard_normal((*shape, 3)))
     background = np.full((*shape, 3), GREY)
     to_bytes = lambda image: np.clip(image, 0, 255).round().astype(np.uint8)

@@ -32,6 +32,21 @@ def test_a_tilted_and_bent_zero_is_taken_out() -> None:
     np.testing.assert_allclose(found, clean, atol=2e-3)
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_gel_that_sinks_around_a_contact_is_no_zero_level(sign: int) -> None:
+    """A sinking of the supposed decay is left in the depth; gel that rises there is taken for a fault as before."""
+    config = ZeroConfig()
+    _, slope = pressed(160, 120)
+    steep = np.where(slope > config.steep, 1.0, 0.0).astype(np.float32)
+    y, x = np.mgrid[:240, :320]
+    away = np.maximum(np.hypot(x - 160, y - 120) - np.sqrt(steep.sum() / np.pi), 0) * PITCH
+    sunk = sign * 0.15 * np.exp(-away / config.sinks_mm).astype(np.float32)
+    tilt = (0.05 * x / 320 - 0.03 * y / 240).astype(np.float32)
+    left = (sunk + tilt) - zero_level(sunk + tilt, steep, PITCH, config)
+    error = np.abs(left - sunk)[steep > 0].max()
+    assert (error < 0.005) == (sign > 0)
+
+
 @pytest.mark.parametrize(("columns", "degree"), [(20, 2), (19, 1), (8, 1), (7, 0)])
 def test_the_share_of_untouched_gel_sets_the_degree_of_its_zero(columns: int, degree: int) -> None:
     """Of 50 columns of cells 40 % are enough for a quadratic, 15 % for a plane; less gives a constant."""

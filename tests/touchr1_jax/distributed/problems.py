@@ -16,7 +16,8 @@ from tests.touchr1_jax import tiny
 from tests.touchr1_jax.drawn import draw_params
 from touchr1_jax.distributed.placement import gather_params
 from touchr1_jax.models.layers import GatedMLP, RMSNorm
-from touchr1_jax.models.lora import LoraConfig, Trainable, adapt, init_adapters
+from touchr1_jax.models.lora import LoraConfig, init_adapters
+from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.predictor import PredictorConfig
 from touchr1_jax.rl.config import GRPOConfig, Paper
 from touchr1_jax.rl.grpo import FrozenInputs, GRPOState, make_grpo_step, start_state
@@ -133,11 +134,11 @@ def adapters() -> TrainingProblem:
     """SFT whose decoder stands still under adapters of rank 2, beside encoders that are trained in full."""
     plain = sft()
     base, towers = _apart(plain.state.params)
-    trained = Trainable(adapters=_adapters(base), towers=towers)
+    trained = {"adapters": _adapters(base), **towers}
     state = SFTState(params=trained, opt_state=OPTIMIZER.init(trained), step=jnp.int32(0))
 
     def step(state: SFTState, batch: SFTBatch, base: Params) -> tuple[SFTState, dict[str, jax.Array]]:
-        return make_sft_step(adapt(FNS, base, LORA), OPTIMIZER)(state, batch)
+        return make_sft_step(_on(base), OPTIMIZER)(state, batch)
 
     return TrainingProblem(lambda gather: jax.jit(step, donate_argnums=0), state, plain.item, (base,))
 
@@ -146,18 +147,23 @@ def adapters_grpo() -> TrainingProblem:
     """GRPO of adapters; others are the reference."""
     plain = grpo()
     base, _ = _apart(plain.state.params)
-    trained = Trainable(adapters=_adapters(base), towers={})
+    trained = {"adapters": _adapters(base)}
     optimizer = falling_adamw(1e-3, 0.1, STEPS, 1.0)
     state = start_state(trained, optimizer, jax.random.key(0), GRPO)
-    frozen = FrozenInputs(reference=Trainable(adapters=_adapters(base, 1), towers={}), noise=plain.shared[0].noise)
+    frozen = FrozenInputs(reference={"adapters": _adapters(base, 1)}, noise=plain.shared[0].noise)
 
     def make_step(gather: Gather) -> Callable[..., Any]:
         def step(state: GRPOState, batch: GRPOBatch, frozen: FrozenInputs, base: Params):
-            return make_grpo_step(adapt(FNS, base, LORA), score, optimizer, GRPO, gather=gather)(state, batch, frozen)
+            return make_grpo_step(_on(base), score, optimizer, GRPO, gather=gather)(state, batch, frozen)
 
         return jax.jit(step, donate_argnums=0)
 
     return TrainingProblem(make_step, state, plain.item, (frozen, base))
+
+
+def _on(base: Params) -> PolicyFns:
+    """The policy with adapters on a frozen base."""
+    return dataclasses.replace(FNS, lora=LORA, base=base)
 
 
 def _apart(params: Params) -> tuple[Params, Params]:

@@ -41,12 +41,13 @@ def seven():
 
 def test_kernels_of_the_decoder_by_hand(seven):
     found = specs({"decoder": seven["decoder"]})
-    layer = "decoder/layers_27"
+    layer = "decoder/last_layer"
     assert found[f"{layer}/q_proj/kernel"] == P("fsdp", "tensor")
     assert found[f"{layer}/q_proj/bias"] == P("tensor")
     assert found[f"{layer}/o_proj/kernel"] == P("tensor", "fsdp")
     assert found[f"{layer}/mlp/down/kernel"] == P("tensor", "fsdp")
     assert found[f"{layer}/norm_mlp/scale"] == P(None)
+    assert found["decoder/layers/q_proj/kernel"] == P(None, "fsdp", "tensor")
     assert found["decoder/embedding/embedding"] == P("tensor", "fsdp")
     assert found["decoder/head/kernel"] == P("fsdp", "tensor")
 
@@ -71,17 +72,17 @@ def test_states_of_all_stages_are_named_and_moments_lie_as_their_parameters(name
 
 
 def test_adapters_lie_as_the_layers_that_they_change(seven):
-    base = {"decoder": {"layers_0": seven["decoder"]["layers_0"]}}
+    base = {"decoder": {name: seven["decoder"][name] for name in ("layers", "last_layer")}}
     adapters = jax.eval_shape(lambda: init_adapters(jax.random.key(0), base, LoraConfig(rank=3)))
     found = specs(adapters)
-    assert found["decoder/layers_0/q_proj/a"] == P("fsdp", None)
-    assert found["decoder/layers_0/q_proj/b"] == P(None, "tensor")
-    assert found["decoder/layers_0/mlp/down/a"] == P("tensor", None)
+    assert found["decoder/last_layer/q_proj/a"] == P("fsdp", None)
+    assert found["decoder/last_layer/q_proj/b"] == P(None, "tensor")
+    assert found["decoder/layers/mlp/down/a"] == P(None, "tensor", None)
 
 
 def test_gathered_parameters_keep_their_share_of_the_heads(seven):
-    layer = {"layers_0": seven["decoder"]["layers_0"]}
-    found = gathered_shardings(MESH, layer)["layers_0"]
+    layer = {"last_layer": seven["decoder"]["last_layer"]}
+    found = gathered_shardings(MESH, layer)["last_layer"]
     assert found["q_proj"]["kernel"].spec == P(None, "tensor")
     assert found["o_proj"]["kernel"].spec == P("tensor", None)
     assert found["q_proj"]["bias"].spec == P("tensor")
@@ -106,8 +107,8 @@ def test_a_parameter_of_another_rank_is_named():
 
 def test_a_large_parameter_that_an_axis_does_not_divide_is_named(seven):
     """3420 hidden channels of the published vision tower over eight devices."""
-    with pytest.raises(ValueError, match=r"blocks_0/mlp/\w+/\w+ has shape .*multiple of mesh tensor = 8"):
-        state_shardings(MeshConfig(tensor=8).abstract(), {"vision": {"blocks_0": seven["vision"]["blocks_0"]}})
+    with pytest.raises(ValueError, match=r"blocks/mlp/\w+/\w+ has shape .*multiple of mesh tensor = 8"):
+        state_shardings(MeshConfig(tensor=8).abstract(), {"vision": {"blocks": seven["vision"]["blocks"]}})
 
 
 def test_a_small_parameter_that_an_axis_does_not_divide_stays_whole_and_a_large_one_is_named():

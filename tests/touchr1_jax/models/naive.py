@@ -53,8 +53,9 @@ def logits(
     seen = np.tril(np.ones((length, length), bool)) & np.append(mask, np.ones(len(tokens), bool))
     seen |= np.eye(length, dtype=bool)
     x = jnp.concatenate([prompt, p["embedding"]["embedding"][tokens]])
-    for i in range(config.num_layers):
-        x = layer(p[f"layers_{i}"], x, positions, seen, config)
+    for i in range(config.num_layers - 1):
+        x = layer(jax.tree.map(lambda stack, i=i: stack[i], p["layers"]), x, positions, seen, config)
+    x = layer(p["last_layer"], x, positions, seen, config)
     scores = rms(x, p["norm"]["scale"]) @ p["embedding"]["embedding"].T
     return scores[len(prompt) - 1 : -1]
 

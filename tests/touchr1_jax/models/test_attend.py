@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.touchr1_jax import tiny
+from touchr1_jax.models.blocked_attention import PREFILL_ROWS, LayerCache, attend_causally
 from touchr1_jax.models.layers import MASKED, KeySource, attend
-from touchr1_jax.models.lm import PREFILL_ROWS, LayerCache, attend_causally
 
 KV, R, D = 2, 3, 4
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from tests.touchr1_jax import tiny
-from touchr1_jax.models.lm import Decoder, DecoderConfig, LayerCache, PrefixCache
+from touchr1_jax.models.blocked_attention import LayerCache
+from touchr1_jax.models.lm import Caches, Decoder, DecoderConfig, PrefixCache
 
 CONFIG = dataclasses.replace(tiny.CONFIG.decoder, tie_embedding=False)
 DECODER = Decoder(CONFIG)
@@ -29,14 +30,14 @@ def prefill(params, x):
 
 def filled(value):
     """Caches of all layers, every entry `value`."""
-    rows = jnp.full((CONFIG.num_kv_heads, T, CONFIG.head_dim), value)
-    return (LayerCache(rows, rows),) * CONFIG.num_layers
+    rows = lambda *n: LayerCache(*(jnp.full((*n, CONFIG.num_kv_heads, T, CONFIG.head_dim), value),) * 2)
+    return Caches(rows(CONFIG.num_layers - 1), rows())
 
 
 def test_prefix_is_causal_by_zero_gradients(params):
     """The deepest keys of token i: gradient exactly 0 towards inputs j > i, and not 0 towards any j ≤ i."""
     x = jnp.asarray(np.random.default_rng(1).normal(size=(L, D)), jnp.float32)
-    keys = jax.jit(jax.jacobian(lambda x: prefill(params, x)[1].layers[-1].k.sum((0, 2))))(x)
+    keys = jax.jit(jax.jacobian(lambda x: prefill(params, x)[1].caches.last.k.sum((0, 2))))(x)
     depends = np.asarray(jnp.any(keys != 0, -1))  # [i, j]
     np.testing.assert_array_equal(depends, np.tril(np.ones((L, L), bool)))
 
@@ -100,7 +101,7 @@ def test_decoding_a_batch_writes_the_row_that_each_alone_writes(params, cache_ax
     for i, token in enumerate(tokens):
         alone = step(token, t, fresh)
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[i], b, atol=1e-5), together, alone)
-    np.testing.assert_array_equal((together[0].k == 5).all((0, 1, 3)), np.arange(T) != 2)
+    np.testing.assert_array_equal((together.last.k == 5).all((0, 1, 3)), np.arange(T) != 2)
     with pytest.raises(ValueError, match="do not batch t"):
         jax.vmap(step, (None, 0, None))(tokens[0], jnp.arange(2), fresh)
 
@@ -112,5 +113,5 @@ def test_heads_must_group():
 
 def test_fresh_prefix_is_a_pytree_that_vmap_can_leave_alone():
     layer = LayerCache(jnp.zeros((1, 2, 4)), jnp.zeros((1, 2, 4)))
-    prefix = PrefixCache((layer,), jnp.ones(2, bool), jnp.int32(2))
+    prefix = PrefixCache(Caches(None, layer), jnp.ones(2, bool), jnp.int32(2))
     assert len(jax.tree.leaves(prefix)) == 4

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import flax.traverse_util
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,10 +10,10 @@ import pytest
 from tests.touchr1_jax import tiny
 from touchr1_jax.models.layers import GatedMLP
 from touchr1_jax.models.lm import Decoder
-from touchr1_jax.models.lora import Adapter, LoraConfig, Trainable, adapt, adapted, init_adapters, kept_share, merge
+from touchr1_jax.models.lora import LoraConfig, adapted, by_layer, init_adapters, kept_share, merge
 
 LORA = LoraConfig(rank=3, alpha=6.0)
-MLP = LoraConfig(rank=3, layers=("gate", "up", "down"))
+MLP = LoraConfig(rank=3, targets=("gate", "up", "down"))
 FNS = tiny.SHALLOW
 L = 5
 
@@ -31,12 +30,16 @@ def loud(adapters):
     return jax.tree.map(draw, adapters)
 
 
-def states(params):
+def variables(params, adapters):
+    return {"params": params, "adapters": adapters}
+
+
+def states(variables):
     """Hidden states of a prompt of the decoder alone."""
     x = jnp.asarray(np.random.default_rng(0).normal(size=(L, tiny.CONFIG.decoder.hidden_size)), jnp.float32)
     decoder = Decoder(FNS.module.config.decoder)
     positions = jnp.tile(jnp.arange(L), (3, 1))
-    return decoder.apply({"params": params}, x, positions, jnp.ones(L, bool), method=Decoder.states)[0]
+    return decoder.apply(variables, x, positions, jnp.ones(L, bool), method=Decoder.states)[0]
 
 
 def logits(fns, params):
@@ -48,7 +51,7 @@ def logits(fns, params):
 def test_a_dense_layer_by_hand():
     """x W + (α/r) (x A) B with one input, one output, rank 1 and α = 2."""
     base = {"decoder": {"q_proj": {"kernel": jnp.array([[5.0]])}}}
-    adapters = {"decoder": {"q_proj": Adapter(a=jnp.array([[3.0]]), b=jnp.array([[7.0]]))}}
+    adapters = {"decoder": {"q_proj": {"a": jnp.array([[3.0]]), "b": jnp.array([[7.0]])}}}
     merged = merge(base, adapters, LoraConfig(rank=1, alpha=2.0))
     assert merged["decoder"]["q_proj"]["kernel"] == 5 + 2 * 3 * 7
     assert base["decoder"]["q_proj"]["kernel"] == 5
@@ -60,29 +63,28 @@ def test_fresh_adapters_change_nothing():
     base = GatedMLP(5).init(jax.random.key(0), x)["params"]
     adapters = init_adapters(jax.random.key(1), {"decoder": base}, MLP)["decoder"]
     before = GatedMLP(5).apply({"params": base}, x)
-    with adapted(adapters, MLP):
-        np.testing.assert_array_equal(GatedMLP(5).apply({"params": base}, x), before)
-    with adapted(loud(adapters), MLP):
-        assert (GatedMLP(5).apply({"params": base}, x) != before).all()
+    with adapted(MLP.scale):
+        np.testing.assert_array_equal(GatedMLP(5).apply(variables(base, adapters), x), before)
+        assert (GatedMLP(5).apply(variables(base, loud(adapters)), x) != before).all()
     np.testing.assert_array_equal(GatedMLP(5).apply({"params": base}, x), before)
 
 
 def test_adapters_have_the_shapes_of_their_layers(base):
-    layer = init_adapters(jax.random.key(0), base, LORA)["decoder"]["layers_0"]
+    layer = init_adapters(jax.random.key(0), base, LORA)["decoder"]["last_layer"]
     c = FNS.module.config.decoder
     assert set(layer) == {"q_proj", "k_proj", "v_proj", "o_proj", "mlp"}
-    assert layer["k_proj"].a.shape == (c.hidden_size, 3)
-    assert layer["k_proj"].b.shape == (3, c.num_kv_heads * c.head_dim)
+    assert layer["k_proj"]["a"].shape == (c.hidden_size, 3)
+    assert layer["k_proj"]["b"].shape == (3, c.num_kv_heads * c.head_dim)
     bound = 1 / np.sqrt(c.intermediate_size)
-    a = layer["mlp"]["down"].a
-    assert 0.8 * bound < float(jnp.abs(a).max()) <= bound
+    a = layer["mlp"]["down"]["a"]
+    assert 0.8 * bound < float(np.abs(a).max()) <= bound
 
 
 def test_merged_parameters_compute_the_same(base):
     """Prompt, completion and their gradients by both ways; far from the base."""
     adapters = loud(init_adapters(jax.random.key(0), base, LORA))
-    fns = adapt(FNS, base, LORA)
-    ours = logits(fns, Trainable(adapters=adapters, towers={}))
+    fns = dataclasses.replace(FNS, lora=LORA, base=base)
+    ours = logits(fns, {"adapters": adapters})
     theirs = logits(FNS, merge(base, adapters, LORA))
     assert float(jnp.abs(ours - logits(FNS, base)).max()) > 0.5
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=2e-5 * float(jnp.abs(theirs[..., tiny.WRITABLE]).max()))
@@ -93,43 +95,40 @@ def test_gradients_are_those_through_the_merged_parameters(base):
     inner = loud(init_adapters(jax.random.key(0), decoder, LORA))["decoder"]
 
     def ours(adapters):
-        with adapted(adapters, LORA):
-            return jnp.sum(jnp.sin(states(base["decoder"])))
+        with adapted(LORA.scale):
+            return jnp.sum(jnp.sin(states(variables(base["decoder"], adapters))))
 
-    theirs = lambda adapters: jnp.sum(jnp.sin(states(merge(base["decoder"], adapters, LORA))))
+    theirs = lambda adapters: jnp.sum(jnp.sin(states({"params": merge(base["decoder"], adapters, LORA)})))
     for a, b in zip(*(jax.tree.leaves(jax.jit(jax.grad(f))(inner)) for f in (ours, theirs)), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4 * float(jnp.abs(b).max()))
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4 * float(np.abs(b).max()))
 
 
 def test_layers_that_are_computed_twice_are_adapted_both_times(base):
     """Values and gradients of a policy that keeps little for its backward pass."""
-    params = Trainable(adapters=loud(init_adapters(jax.random.key(0), base, LORA)), towers={})
-    fns = adapt(FNS, base, LORA)
+    params = {"adapters": loud(init_adapters(jax.random.key(0), base, LORA))}
+    fns = dataclasses.replace(FNS, lora=LORA, base=base)
     lean = dataclasses.replace(fns, module=fns.module.clone(remat=True))
     total = lambda a: jax.value_and_grad(lambda p: jnp.sum(jnp.sin(logits(a, p)[..., tiny.WRITABLE])))(params)
     for a, b in zip(jax.tree.leaves(total(lean)), jax.tree.leaves(total(fns)), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5 * float(jnp.abs(b).max()))
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5 * float(np.abs(b).max()))
 
 
 def test_only_named_layers_of_named_towers_are_adapted(base):
-    config = dataclasses.replace(LORA, layers=("v_proj",))
-    assert paths(init_adapters(jax.random.key(0), base, config)) == {"decoder/layers_0/v_proj"}
-    config = dataclasses.replace(LORA, layers=("qkv", "out"), towers=("tactile", "vision"))
-    assert {path.split("/")[0] for path in paths(init_adapters(jax.random.key(0), base, config))} == {
-        "tactile",
-        "vision",
-    }
+    config = dataclasses.replace(LORA, targets=("v_proj",))
+    assert paths(init_adapters(jax.random.key(0), base, config)) == {"decoder/last_layer/v_proj"}
+    config = dataclasses.replace(LORA, targets=(), vision_targets=("qkv", "out"))
+    assert {path.split("/")[0] for path in paths(init_adapters(jax.random.key(0), base, config))} == {"vision"}
 
 
 def paths(adapters) -> set[str]:
-    return {"/".join(path) for path in flax.traverse_util.flatten_dict(adapters)}
+    return {"/".join(path) for path in by_layer(adapters)}
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"layers": ("q_proj", "query")}, r"layers \['query'\] have no dense layer"),
-        ({"towers": ("decoder", "nose")}, r"towers \['nose'\] have no dense layer"),
+        ({"targets": ("q_proj", "query")}, r"targets \['query'\] are no dense layers of decoder; name others"),
+        ({"vision_targets": ("nose",)}, r"targets \['nose'\] are no dense layers of vision"),
     ],
 )
 def test_layers_must_exist(base, change, message):
@@ -137,13 +136,26 @@ def test_layers_must_exist(base, change, message):
         init_adapters(jax.random.key(0), base, dataclasses.replace(LORA, **change))
 
 
-def test_rank_must_be_positive():
-    with pytest.raises(ValueError, match="rank is 0: must be at least 1"):
-        LoraConfig(rank=0)
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"rank": -1}, "rank is -1: must be at least 0"),
+        ({"alpha": 0.0}, "alpha is 0"),
+        ({"targets": ()}, r"targets are \(\): must name a layer where rank is above 0"),
+    ],
+)
+def test_settings_are_checked(fields, message):
+    with pytest.raises(ValueError, match=message):
+        LoraConfig(**fields)
+
+
+def test_the_scale_by_hand():
+    assert LoraConfig(rank=16, alpha=32.0).scale == 2
+    assert LoraConfig(rank=16, alpha=32.0, rank_stabilised=True).scale == 8
 
 
 def test_foreign_adapters_are_not_merged(base):
-    foreign = {"decoder": {"layers_9": {"q_proj": Adapter(a=jnp.ones((1, 1)), b=jnp.ones((1, 1)))}}}
+    foreign = {"decoder": {"layers_9": {"q_proj": {"a": jnp.ones((1, 1)), "b": jnp.ones((1, 1))}}}}
     with pytest.raises(ValueError, match="belong to no layer of the base"):
         merge(base, foreign, LORA)
 
@@ -166,13 +178,13 @@ def test_half_precision_base_stays_so(base):
 )
 def test_what_a_coarse_type_keeps_of_a_change_by_hand(dtype, change, kept):
     base = {"decoder": {"q_proj": {"kernel": jnp.ones((1, 1), dtype)}}}
-    adapters = {"decoder": {"q_proj": Adapter(a=jnp.array([[change]]), b=jnp.array([[1.0]]))}}
+    adapters = {"decoder": {"q_proj": {"a": jnp.array([[change]]), "b": jnp.array([[1.0]])}}}
     lora = LoraConfig(rank=1, alpha=1.0)
     assert kept_share(base, merge(base, adapters, lora), adapters, lora) == pytest.approx(kept)
 
 
 def test_a_change_of_context_reaches_the_frozen_base():
-    fns = adapt(tiny.SHALLOW, {"decoder": {"scale": jnp.ones(2)}}, LoraConfig(rank=1))
+    fns = dataclasses.replace(tiny.SHALLOW, base={"decoder": {"scale": jnp.ones(2)}})
     doubled = fns.with_context(lambda params: jax.tree.map(lambda x: 2 * x, params))
     assert doubled.base["decoder"]["scale"].tolist() == [2, 2]
     assert tiny.SHALLOW.with_context(lambda params: None) is tiny.SHALLOW

@@ -57,7 +57,7 @@ def test_a_released_model_is_trained(tmp_path):
     state = SFTState(params=trained, opt_state=optimizer.init(trained), step=jnp.int32(0))
     state, metrics = known["step"](base, state, make_batch(known["layout"]))
     assert np.isfinite(metrics["loss"])
-    merged = merge(base, state.params.adapters, lora)
+    merged = merge(base, state.params["adapters"], lora)
     changed = jax.tree.map(lambda a, b: bool((a != b).any()), merged, base)
     assert not any(jax.tree.leaves(changed["vision"]))
     assert any(jax.tree.leaves(changed["decoder"]))

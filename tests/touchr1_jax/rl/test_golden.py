@@ -45,7 +45,7 @@ def trajectory() -> dict[str, list[float]]:
     """Metrics of each step, and the norm and one projection of the parameters after it."""
     optimizer = falling_adamw(CONFIG.learning_rate * CONFIG.lr_scale, CONFIG.final_share, 10, CONFIG.max_grad_norm)
     step = make_grpo_step(tiny.SHALLOW, score, optimizer, CONFIG)
-    params = jax.tree.map(jnp.copy, tiny.shallow_params(0, loud=0.2))
+    params = tiny.copy(tiny.shallow_params(0, loud=0.2))
     shape = (3, tiny.S, tiny.N, tiny.CONFIG.decoder.hidden_size)
     noise = jnp.asarray(np.random.default_rng(5).normal(size=shape), jnp.float32)
     frozen = FrozenInputs(reference=tiny.shallow_params(1, loud=0.2), noise=noise)

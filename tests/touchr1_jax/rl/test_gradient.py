@@ -91,12 +91,13 @@ def test_loss_and_parts_equal_a_float64_reference(experience, whole):
 def test_gradient_is_that_of_the_loss(experience, whole):
     """A directional derivative of the float32 loss against the dot product with the gradient."""
     rng = np.random.default_rng(1)
-    direction = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), jnp.float32), PARAMS)
+    direction = jax.tree.map(lambda x: rng.normal(size=x.shape).astype(np.float32), PARAMS)
     forward = lambda params: compute(experience, params)[1]["loss"]
     h = 1e-3
-    ahead, behind = (jax.tree.map(lambda x, d, s=s: x + s * h * d, PARAMS, direction) for s in (1, -1))
+    moved = lambda by: jax.tree.map(lambda x, d: np.asarray(x) + np.float32(by) * d, PARAMS, direction)
+    ahead, behind = moved(h), moved(-h)
     slope = (float(forward(ahead)) - float(forward(behind))) / (2 * h)
-    dot = sum(float(jnp.vdot(g, d)) for g, d in zip(*map(jax.tree.leaves, (whole[0], direction)), strict=True))
+    dot = sum(float(np.vdot(g, d)) for g, d in zip(*map(jax.tree.leaves, (whole[0], direction)), strict=True))
     assert slope == pytest.approx(dot, rel=2e-2)
 
 
@@ -113,7 +114,7 @@ def test_micro_batches_of_one_prompt_give_the_same_gradient(one_stream):
     """A single prompt encodes again from the perturbed stream on, not from the first one."""
     whole = compute(one_stream, PARAMS)
     grads, parts, _ = gradient(dataclasses.replace(CONFIG, micro_prompts=1))(one_stream)
-    scale = max(float(jnp.abs(g).max()) for g in jax.tree.leaves(whole[0]))
+    scale = max(float(np.abs(g).max()) for g in jax.tree.leaves(whole[0]))
     for a, b in zip(jax.tree.leaves(grads), jax.tree.leaves(whole[0]), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5 * scale)
     for name, value in whole[1].items():
@@ -124,7 +125,7 @@ def test_stopped_branch_changes_the_gradient_but_no_value(one_stream):
     stopped = dataclasses.replace(CONFIG, algorithm=dataclasses.replace(ALGORITHM, grounding_stop_masked=True))
     (free, free_parts, _), (held, held_parts, _) = compute(one_stream, PARAMS), gradient(stopped)(one_stream)
     np.testing.assert_allclose(held_parts["loss"], free_parts["loss"], rtol=1e-5)
-    assert any(jnp.abs(a - b).max() > 1e-4 for a, b in zip(*map(jax.tree.leaves, (free, held)), strict=True))
+    assert any(np.abs(np.subtract(a, b)).max() > 1e-4 for a, b in zip(*map(jax.tree.leaves, (free, held)), strict=True))
 
 
 def test_grounding_is_logged_for_every_stream(one_stream):
@@ -139,19 +140,18 @@ def test_blocks_of_tokens_give_the_gradient_of_all_of_them(one_stream):
     """Three tokens' logits at a time, of policy, reference and perturbed policy, each with its KL."""
     whole = compute(one_stream, PARAMS)
     grads, parts, _ = gradient(dataclasses.replace(CONFIG, max_logits=3 * tiny.V))(one_stream)
-    scale = max(float(jnp.abs(g).max()) for g in jax.tree.leaves(whole[0]))
+    scale = max(float(np.abs(g).max()) for g in jax.tree.leaves(whole[0]))
     for a, b in zip(*map(jax.tree.leaves, (grads, whole[0])), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5 * scale)
     for name, value in whole[1].items():
         np.testing.assert_allclose(parts[name], value, rtol=1e-5, atol=1e-6, err_msg=name)
 
 
-@pytest.mark.parametrize("bfloat16", [False, True], ids=["float32", "bfloat16"])
 @pytest.mark.parametrize("kind", Surrogate)
-def test_no_ratio_is_clipped_at_the_first_update_whatever_the_sampler_computed(experience, kind, bfloat16):
-    """The sampler's log-probabilities are off by up to ±.6, and the clip range is a millionth."""
+def test_no_ratio_is_clipped_at_the_first_update_whatever_the_sampler_computed(experience, kind):
+    """The sampler's log-probabilities are off by up to ±.6, the clip range is a millionth, and bfloat16 rounds."""
     algorithm = Paper(surrogate=kind, clip_low=1e-6, clip_high=1e-6, beta=0.0, gamma=0.0)
-    config = dataclasses.replace(CONFIG, algorithm=algorithm, bfloat16=bfloat16)
+    config = dataclasses.replace(CONFIG, algorithm=algorithm, bfloat16=True)
     both = jax.jit(lambda e, first: grpo_gradient(FNS, config, PARAMS, REFERENCE, e, first=first))
     _, parts, old = both(experience, True)
     assert parts["clip_share"] == 0
@@ -196,7 +196,7 @@ def alone():
 
 def test_zero_advantage_has_a_gradient_of_exactly_zero(experience, alone):
     grads, parts, _ = alone(experience._replace(advantage=jnp.zeros((P, G))))
-    assert not any(g.any() for g in jax.tree.leaves(grads))
+    assert not any(np.any(g) for g in jax.tree.leaves(grads))
     assert parts["loss"] == 0
     assert parts["grounding"] == 0  # not computed at γ = 0
 

@@ -51,7 +51,7 @@ def score(tokens: jax.Array, target: Target) -> tuple[jax.Array, dict[str, jax.A
 
 def state(seed: int = 0) -> GRPOState:
     """A fresh state on buffers of its own, since the step takes them over."""
-    params = jax.tree.map(jnp.copy, tiny.shallow_params(0))
+    params = tiny.copy(tiny.shallow_params(0))
     return GRPOState(params=params, opt_state=OPTIMIZER.init(params), step=jnp.int32(0), key=jax.random.key(seed))
 
 
@@ -70,7 +70,7 @@ class Run:
         self.before, self.metrics = [], []
         now = state()
         for batch in self.batches:
-            self.before.append(jax.tree.map(jnp.copy, now))
+            self.before.append(tiny.copy(now))
             now, metrics = self.step(now, batch, FROZEN)
             self.metrics.append(metrics)
         self.end = now
@@ -85,7 +85,7 @@ def run() -> Run:
 def test_no_nan_under_debug_nans(run):
     """`debug_nans` looks at every array that leaves the program."""
     with jax.debug_nans(True):
-        run.step(jax.tree.map(jnp.copy, run.before[0]), run.batches[0], FROZEN)
+        run.step(tiny.copy(run.before[0]), run.batches[0], FROZEN)
 
 
 draw = jax.jit(lambda p, b, k: sample_group(FNS, p, b, k, DRAW))
@@ -163,7 +163,7 @@ def test_one_trace_serves_all_batches(run):
 def test_nothing_leaves_the_device_inside_a_step(run):
     batch = jax.tree.map(jnp.asarray, tiny.question_batch(4, P))
     with jax.transfer_guard("disallow"):
-        now, metrics = run.step(jax.tree.map(jnp.copy, run.end), batch, FROZEN)
+        now, metrics = run.step(tiny.copy(run.end), batch, FROZEN)
     assert int(now.step) == 4
     assert all(isinstance(value, jax.Array) for value in metrics.values())
     host = jax.tree.map(np.asarray, batch)
@@ -187,7 +187,7 @@ def test_steps_draw_afresh(run):
 
 
 def test_state_is_donated_and_nothing_else(run):
-    now = jax.tree.map(jnp.copy, run.before[0])
+    now = tiny.copy(run.before[0])
     run.step(now, run.batches[0], FROZEN)
     assert all(leaf.is_deleted() for leaf in jax.tree.leaves(now))
     assert not any(leaf.is_deleted() for leaf in jax.tree.leaves((run.batches[0], FROZEN)))
@@ -200,6 +200,13 @@ def test_metrics_are_finite_scalars(run):
             assert np.isfinite(value), name
     expected = {"loss", "surrogate", "kl", "grounding", "entropy", "clip_share", "reward", "reward_right", "grad_norm"}
     assert expected <= set(run.metrics[0])
+
+
+def test_grounding_of_every_stream_is_logged(run):
+    for metrics in run.metrics:
+        assert sum(metrics[f"perturbed_stream_{s}"] for s in range(tiny.S)) == P
+        present = [s for s in range(tiny.S) if metrics[f"perturbed_stream_{s}"]]
+        assert all(metrics[f"grounding_stream_{s}"] > 1e-3 for s in present)
 
 
 def test_surrogate_is_on_policy(run):

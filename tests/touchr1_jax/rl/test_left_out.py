@@ -21,22 +21,28 @@ CONFIG = GRPOConfig(prompts=P, group=3, length=4, micro_prompts=2, algorithm=Pap
 OPTIMIZER = optax.adam(0.05)
 
 
-def step_with(value: float):
-    """State and metrics after a step in which every answer to the first prompt's question earns this."""
+BROKEN, EQUAL = 1, 2
+"""Labels of the first prompt's question for which each of its answers earns NaN, and the same."""
 
-    def worth(tokens, target):
-        reward, terms, parsed = score(tokens, target)
-        spread = jnp.where(target.asked[0], value, 0.0)
-        return jnp.where(target.asked[0], value, reward), {**terms, "spread": spread}, parsed
 
-    step = make_grpo_step(FNS, worth, OPTIMIZER, CONFIG)
-    state = start_state(tiny.shallow_params(0), OPTIMIZER, jax.random.key(1), CONFIG)
-    return jax.device_get(step(state, tiny.question_batch(1, P), FROZEN))
+def worth(tokens, target):
+    """What `score` pays, but for the first question."""
+    reward, terms, parsed = score(tokens, target)
+    value = jnp.where(target.label[0] == BROKEN, jnp.nan, 0.4)
+    spread = jnp.where(target.asked[0], value, 0.0)
+    return jnp.where(target.asked[0], value, reward), {**terms, "spread": spread}, parsed
 
 
 def test_a_reward_that_is_nan_costs_its_group_and_nothing_else():
     """The step is that of a group whose rewards are all equal, which teaches nothing either."""
-    (broken, metrics), (equal, _) = step_with(np.nan), step_with(0.4)
+    step, batch = make_grpo_step(FNS, worth, OPTIMIZER, CONFIG), tiny.question_batch(1, P)
+
+    def learn(label):
+        state = start_state(tiny.shallow_params(0), OPTIMIZER, jax.random.key(1), CONFIG)
+        target = batch.target.replace(label=jnp.where(batch.target.asked[:, :1], label, batch.target.label))
+        return jax.device_get(step(state, batch.replace(target=target), FROZEN))
+
+    (broken, metrics), (equal, _) = learn(BROKEN), learn(EQUAL)
     jax.tree.map(np.testing.assert_array_equal, broken.params, equal.params)
     assert all(np.isfinite(value) for value in metrics.values())
     assert metrics["nonfinite_share"] == metrics["nonfinite_in_spread"] == 1 / P

@@ -100,7 +100,7 @@ def test_credit_reaches_the_first_of_two_steps():
     """One rollout in about twenty-five is paid at first."""
     step = make_grpo_step(FEW, two_steps, OPTIMIZER, CONFIG)
     batch = batch_of(np.zeros(P, int), np.zeros(P, int))
-    params = jax.tree.map(jnp.copy, tiny.shallow_params(0, loud=0.2))
+    params = tiny.copy(tiny.shallow_params(0, loud=0.2))
     state = start_state(params, OPTIMIZER, jax.random.key(0), CONFIG)
     frozen = FrozenInputs(reference=params, noise=jnp.zeros((1, *batch.features.touch.shape[1:])))
     for _ in range(200):

@@ -48,18 +48,26 @@ def params():
     return {**tiny.params(), **tiny.shallow_params()}
 
 
+loss = jax.jit(lambda p, b: sft_loss(FNS, p, b))
+gradient = jax.jit(lambda p, b: sft_gradient(FNS, p, b))
+group_logits = jax.jit(jax.vmap(FNS.group_logits, in_axes=(None, 0, 0, 0, 0)))
+
+
+def assert_same_gradient(found, expected) -> None:
+    """Relative to the largest number of all: some are rounding alone."""
+    scale = max(float(np.abs(g).max()) for g in jax.tree.leaves(expected))
+    for a, b in zip(*map(jax.tree.leaves, (found, expected)), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5 * scale)
+
+
 def test_encoded_contacts_train_the_decoder_as_the_contacts_do_and_nothing_else(params, batch):
     features = jax.jit(lambda p, b: FNS.encode(p, b))(params, batch.touch)
-    (value, right), whole = jax.jit(lambda p: sft_gradient(FNS, p, batch))(params)
+    (value, right), whole = gradient(params, batch)
     again = jax.jit(lambda p: sft_gradient(FNS, p, batch.replace(touch=features)))
     (encoded_value, encoded_right), grads = again({"decoder": params["decoder"]})
     np.testing.assert_allclose((encoded_value, encoded_right), (value, right), rtol=1e-6)
     for a, b in zip(jax.tree.leaves(grads["decoder"]), jax.tree.leaves(whole["decoder"]), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)
-
-
-loss = jax.jit(lambda p, b: sft_loss(FNS, p, b))
-group_logits = jax.jit(jax.vmap(FNS.group_logits, in_axes=(None, 0, 0, 0, 0)))
 
 
 def test_loss_is_the_cross_entropy_of_the_answers_by_hand(params, batch):
@@ -83,27 +91,20 @@ def test_loss_is_the_cross_entropy_of_the_answers_by_hand(params, batch):
 
 def test_blocks_of_tokens_give_the_loss_of_all_of_them(params, batch):
     """And the same gradient, five tokens' logits at a time."""
-    few, all_at_once = (
-        jax.jit(jax.value_and_grad(lambda p, most=most: sft_loss(FNS, p, batch, max_logits=most)[0]))(params)
-        for most in (5 * tiny.V, 10**9)
-    )
-    np.testing.assert_allclose(few[0], all_at_once[0], rtol=1e-6)
-    scale = max(float(jnp.abs(g).max()) for g in jax.tree.leaves(all_at_once[1]))
-    for a, b in zip(*map(jax.tree.leaves, (few[1], all_at_once[1])), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-5 * scale)
+    few = jax.jit(jax.value_and_grad(lambda p: sft_loss(FNS, p, batch, max_logits=5 * tiny.V)[0]))(params)
+    all_at_once = gradient(params, batch)
+    np.testing.assert_allclose(few[0], all_at_once[0][0], rtol=1e-6)
+    assert_same_gradient(few[1], all_at_once[1])
 
 
 def test_micro_batches_sum_to_the_gradient_of_the_batch(params, batch):
     """With unequal numbers of answer tokens: the mean is over the tokens of the batch, not of each micro-batch."""
     uneven = batch.replace(token_mask=batch.token_mask.at[1, 1].set(False).at[0, 0, 5:].set(False))
-    whole, micro = (
-        jax.jit(lambda p, size=size: sft_gradient(FNS, p, uneven, micro_contacts=size))(params) for size in (None, 1)
-    )
+    whole = gradient(params, uneven)
+    micro = jax.jit(lambda p: sft_gradient(FNS, p, uneven, micro_contacts=1))(params)
     np.testing.assert_allclose(micro[0], whole[0], rtol=1e-6)
     np.testing.assert_allclose(whole[0], loss(params, uneven), rtol=1e-6)
-    scale = max(float(jnp.abs(g).max()) for g in jax.tree.leaves(whole[1]))
-    for a, b in zip(*map(jax.tree.leaves, (micro[1], whole[1])), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-5 * scale)
+    assert_same_gradient(micro[1], whole[1])
 
 
 def test_micro_batches_must_divide_the_batch(params, batch):

@@ -1,6 +1,5 @@
 """Which published tensor is which parameter, and how its axes lie there."""
 
-import re
 from typing import NamedTuple
 
 import flax.traverse_util
@@ -9,6 +8,7 @@ from jaxtyping import Array
 
 from touchr1_jax.models.qwen.config import COLOURS, QwenConfig
 from touchr1_jax.models.qwen.model import abstract_params
+from touchr1_jax.models.stacked import LAST, STACKED
 
 PREFIXES = (("model.language_model.", "text."), ("model.visual.", "visual."), ("model.", "text."))
 """Beginnings of keys as newer libraries write them, and last the published one, and what both become here."""
@@ -38,11 +38,16 @@ Path = tuple[str, ...]
 
 
 class Source(NamedTuple):
-    """Where a parameter comes from: key without prefix, shape there, and whether it is turned there, outputs first."""
+    """A published tensor: key without prefix, shape, whether it is turned there, outputs first, and its parameter.
+
+    `row` is the layer in a parameter that stacks all layers of a tower.
+    """
 
     key: str
     shape: tuple[int, ...]
     turned: bool
+    path: Path
+    row: int | None = None
 
 
 def read(published: Array, turned: bool) -> Array:
@@ -51,8 +56,9 @@ def read(published: Array, turned: bool) -> Array:
 
 
 def write(parameter: np.ndarray, source: Source) -> np.ndarray:
-    """The published tensor from the parameter."""
-    return parameter.T.reshape(source.shape) if source.turned else parameter
+    """The published tensor from its parameter."""
+    of_layer = parameter if source.row is None else parameter[source.row]
+    return of_layer.T.reshape(source.shape) if source.turned else of_layer
 
 
 def canonical(key: str) -> str:
@@ -68,24 +74,38 @@ def published(key: str) -> str:
     return "model." + key.removeprefix("text.") if key.startswith("text.") else key
 
 
-def sources(config: QwenConfig) -> dict[Path, Source]:
-    """Source of every parameter, by its path in the tree."""
-    leaves = flax.traverse_util.flatten_dict(abstract_params(config))
-    return {path: source(path, leaf.shape, config) for path, leaf in leaves.items()}
+def sources(config: QwenConfig) -> dict[str, Source]:
+    """Source of every parameter, or of each layer's part of it, by its key without prefix."""
+    found: dict[str, Source] = {}
+    for path, leaf in flax.traverse_util.flatten_dict(abstract_params(config)).items():
+        stack = STACKED.intersection(path)
+        rows = range(leaf.shape[0]) if stack else (None,)
+        for row in rows:
+            made = source(path, leaf.shape[1:] if stack else leaf.shape, config, row)
+            found[made.key] = made
+    return found
 
 
-def source(path: Path, shape: tuple[int, ...], config: QwenConfig) -> Source:
-    """Source of one parameter.
+def source(path: Path, shape: tuple[int, ...], config: QwenConfig, row: int | None = None) -> Source:
+    """Source of one parameter, or of a row of it.
 
     Dense kernels are published as [out, in], the patch embedding as a convolution [out, colour, frame, row, column].
     """
     *modules, leaf = path
     if path == ("decoder", "head", "kernel"):
-        return Source("lm_head.weight", shape[::-1], turned=True)
+        return Source("lm_head.weight", shape[::-1], True, path)
     if path == ("vision", "patch_embed"):
         v = config.vision
         kernel = (v.hidden_size, COLOURS, v.patch_frames, v.patch_px, v.patch_px)
-        return Source("visual.patch_embed.proj.weight", kernel, turned=True)
-    key = ".".join(MODULES.get(name, re.sub(r"_(\d+)$", r".\1", name)) for name in modules)
+        return Source("visual.patch_embed.proj.weight", kernel, True, path)
+    key = ".".join(module_name(name, row, config) for name in modules)
     turned = leaf == "kernel"
-    return Source(f"{key}.{'bias' if leaf == 'bias' else 'weight'}", shape[::-1] if turned else shape, turned)
+    shape = shape[::-1] if turned else shape
+    return Source(f"{key}.{'bias' if leaf == 'bias' else 'weight'}", shape, turned, path, row)
+
+
+def module_name(name: str, row: int | None, config: QwenConfig) -> str:
+    """Published name of a module, that of a layer with its number."""
+    if name == LAST:
+        return f"layers.{config.decoder.num_layers - 1}"
+    return f"{name}.{row}" if name in STACKED else MODULES.get(name, name)

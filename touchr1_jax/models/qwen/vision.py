@@ -4,11 +4,12 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from touchr1_jax.models.layers import GatedMLP, RMSNorm, Rotation, rotate
 from touchr1_jax.models.qwen.config import QwenVisionConfig
 from touchr1_jax.models.qwen.geometry import Geometry, Grid, Groups, geometry
+from touchr1_jax.models.stacked import scan_layers
 
 ROPE_THETA = 1e4
 """Base of the tower's rotary angles, the same in every released checkpoint and named in none."""
@@ -43,9 +44,9 @@ class QwenVision(nn.Module):
         kernel = self.param("patch_embed", nn.initializers.lecun_normal(), (c.patch_size, c.hidden_size))
         x = patches[place.order].astype(kernel.dtype) @ kernel
         rotation = axial_rotation(place, c.hidden_size // c.num_heads)
-        for i in range(c.depth):
-            groups = place.frames if i in c.full_layers else place.windows
-            x = VisionBlock(c, name=f"blocks_{i}")(x, rotation, groups)
+        whole_frames = jnp.isin(jnp.arange(c.depth), jnp.array(c.full_layers, jnp.int32))
+        again = nn.remat(lambda block, y, whole: block(y, rotation, place, whole), prevent_cse=False)
+        x, _ = scan_layers(lambda *args: (again(*args), None), c.depth)(VisionBlock(c, name="blocks"), x, whole_frames)
         x = RMSNorm(name="merger_norm")(x).reshape(-1, c.merge**2 * c.hidden_size)
         x = nn.gelu(nn.Dense(x.shape[-1], name="merger_in")(x), approximate=False)
         return nn.Dense(c.out_size, name="merger_out")(x)[place.token_order]
@@ -57,12 +58,17 @@ class VisionBlock(nn.Module):
     config: QwenVisionConfig
 
     @nn.compact
-    def __call__(self, x: Float[Array, "n D"], rotation: Rotation, groups: Groups) -> Float[Array, "n D"]:
+    def __call__(
+        self, x: Float[Array, "n D"], rotation: Rotation, place: Geometry, whole: Bool[Array, ""]
+    ) -> Float[Array, "n D"]:
+        """All patches; inside the whole frame or inside windows."""
         c = self.config
         qkv = nn.Dense(3 * c.hidden_size, name="qkv")(RMSNorm(name="norm1")(x))
         q, k, v = jnp.split(qkv.reshape(x.shape[0], 3 * c.num_heads, -1), 3, 1)
         turn = lambda y: rotate(y.astype(jnp.float32), rotation).astype(y.dtype)  # angles are never rounded to bf16
-        x = x + nn.Dense(c.hidden_size, name="proj")(attend_within(turn(q), turn(k), v, groups))
+        over = lambda groups: lambda q, k, v: attend_within(q, k, v, groups)
+        mixed = jax.lax.cond(whole, over(place.frames), over(place.windows), turn(q), turn(k), v)
+        x = x + nn.Dense(c.hidden_size, name="proj")(mixed)
         return x + GatedMLP(c.intermediate_size, use_bias=True, name="mlp")(RMSNorm(name="norm2")(x))
 
 

@@ -7,18 +7,20 @@ everything that does not fit is named in one error.
 import functools
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import flax.traverse_util
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import NamedSharding, PartitionSpec, Sharding
 from jaxtyping import Array
 
 from touchr1_jax.models.qwen import names, safetensors
 from touchr1_jax.models.qwen.config import QwenConfig
-from touchr1_jax.models.qwen.names import canonical, published, sources
+from touchr1_jax.models.qwen.model import abstract_params
+from touchr1_jax.models.qwen.names import Source, canonical, published, sources
 from touchr1_jax.types import Params
 
 SINGLE = "model.safetensors"
@@ -32,7 +34,7 @@ def load_params(
     directory: str | Path,
     config: QwenConfig,
     dtype: jnp.dtype | type = jnp.bfloat16,
-    device: jax.Device | None = None,
+    place: Callable[[Params], Params] | None = None,
     progress: safetensors.ReportBytes = lambda done_bytes, all_bytes: None,
 ) -> Params:
     """Parameters of `QwenVL` from the safetensors files of a directory.
@@ -44,7 +46,8 @@ def load_params(
       directory: `model.safetensors`, or `model.safetensors.index.json` with its shards.
       config: shapes that are expected.
       dtype: type of all parameters.
-      device: where they are placed; JAX's default without one.
+      place: from shapes to the sharding of each parameter, such as `rules.state_shardings` of a mesh; each device gets
+        its part of a tensor as it is read.  `None` puts all on JAX's default device.
       progress: called before the first tensor and after each with the bytes of the files that are read, and all.
 
     Raises:
@@ -70,12 +73,19 @@ def load_params(
             f"{directory} does not hold the tensors that its config asks for:{listed}{more}\n"
             "fetch the files again, or read them with the config.json that belongs to them"
         )
-    place = functools.partial(_place, dtype=jnp.dtype(dtype), device=device)
-    by_size = sorted(wanted.items(), key=lambda item: -math.prod(item[1].shape))
-    done, size, loaded = 0, sum(entry.size for entry in entries.values()), {}
+    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, dtype), abstract_params(config))
+    whole = jax.sharding.SingleDeviceSharding(jnp.zeros(()).device)
+    places = jax.tree.map(lambda _: whole, shapes) if place is None else place(shapes)
+    flat, lies = flax.traverse_util.flatten_dict(shapes), flax.traverse_util.flatten_dict(places)
+    done, size = 0, sum(entry.size for entry in entries.values())
+    loaded: dict[names.Path, Array] = {}
     progress(done, size)
-    for path, s in by_size:
-        loaded[path], finite = place(entries[s.key], turned=s.turned)
+    for s in sorted(wanted.values(), key=lambda s: -math.prod(s.shape)):
+        found, finite = _place(entries[s.key], s, flat[s.path].dtype, lies[s.path])
+        if s.row is not None:
+            stack = loaded.pop(s.path) if s.path in loaded else _empty(flat[s.path], lies[s.path])
+            found = _with_row(stack, found, s.row)
+        loaded[s.path] = jax.block_until_ready(found)
         if not finite:
             raise ValueError(
                 f"{entries[s.key].path}: {published(s.key)} holds NaN or infinity as {jnp.dtype(dtype)}: must be "
@@ -135,12 +145,11 @@ def save_params(
     Raises:
       ValueError: a tree that is not that of the config.
     """
-    flat = flax.traverse_util.flatten_dict(params)
-    wanted = sources(config)
-    if flat.keys() != wanted.keys():
-        differ = sorted("/".join(p) for p in flat.keys() ^ wanted.keys())
+    flat, wanted = flax.traverse_util.flatten_dict(params), sources(config)
+    if differ := sorted("/".join(p) for p in flat.keys() ^ {s.path for s in wanted.values()}):
         raise ValueError(f"params and config differ in {', '.join(differ[:SHOWN])}; save with the config of the params")
-    tensors = {published(s.key): names.write(np.asarray(flat[p]), s) for p, s in wanted.items()}
+    host = {name: np.asarray(x) for name, x in flat.items()}
+    tensors = {published(s.key): names.write(host[s.path], s) for s in wanted.values()}
     safetensors.write_file(path, tensors, progress)
 
 
@@ -185,15 +194,32 @@ def _file_of(name: str, entries: Mapping[str, safetensors.TensorEntry]) -> str |
     return entries[name].path.name if name in entries else None
 
 
-def _place(
-    entry: safetensors.TensorEntry, *, turned: bool, dtype: jnp.dtype, device: jax.Device | None
-) -> tuple[Array, Array]:
-    """One parameter on its device, and whether it is finite; waits, so that no two tensors are on their way at once."""
-    raw = jax.device_put(safetensors.read_tensor(entry), device)
-    return jax.block_until_ready(_lay_out(raw, turned, dtype))
+def _place(entry: safetensors.TensorEntry, s: Source, dtype: jnp.dtype, lies: Sharding) -> tuple[Array, Array]:
+    """A tensor laid out as its parameter, or as a row of it, where that lies, and whether it is finite.
+
+    It waits, so that no two tensors are on their way at once.
+    """
+    of_row = lies
+    if isinstance(lies, NamedSharding) and s.row is not None:
+        of_row = NamedSharding(lies.mesh, PartitionSpec(*lies.spec[1:]))
+    as_read = of_row
+    if isinstance(of_row, NamedSharding) and s.turned:
+        spec = (*of_row.spec, None, None)[:2][::-1] if len(s.shape) == 2 else ()
+        as_read = NamedSharding(of_row.mesh, PartitionSpec(*spec))
+    found, finite = _lay_out(jax.device_put(safetensors.read_tensor(entry), as_read), s.turned, dtype)
+    return jax.block_until_ready((jax.device_put(found, of_row), finite))
+
+
+def _empty(shape: jax.ShapeDtypeStruct, lies: Sharding) -> Array:
+    return jnp.zeros(shape.shape, shape.dtype, device=lies)
 
 
 @functools.partial(jax.jit, static_argnames=("turned", "dtype"))
 def _lay_out(raw: Array, turned: bool, dtype: jnp.dtype) -> tuple[Array, Array]:
     found = names.read(raw, turned).astype(dtype)
     return found, jnp.isfinite(found).all()
+
+
+@functools.partial(jax.jit, donate_argnums=0)
+def _with_row(stack: Array, row: Array, i: int) -> Array:
+    return jax.lax.dynamic_update_index_in_dim(stack, row, i, 0)

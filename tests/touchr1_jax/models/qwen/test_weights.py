@@ -1,9 +1,9 @@
 """Checkpoints in every published layout, and every way in which one does not fit."""
 
+import functools
 import json
 import math
 
-import flax.traverse_util
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +11,8 @@ import pytest
 
 from tests.touchr1_jax.models.qwen import tiny
 from tests.touchr1_jax.models.qwen.cases import CASES
+from touchr1_jax.distributed.mesh import MeshConfig
+from touchr1_jax.distributed.rules import state_shardings
 from touchr1_jax.models.qwen.config import released
 from touchr1_jax.models.qwen.model import abstract_params, init_params
 from touchr1_jax.models.qwen.safetensors import write_file
@@ -68,8 +70,9 @@ def test_initial_parameters_have_the_abstract_shapes():
 
 def test_kernels_lie_with_inputs_first(expected, weights):
     """Published as [out, in], and the patch embedding as a convolution."""
-    kernel = expected["decoder"]["layers_1"]["mlp"]["down"]["kernel"]
-    np.testing.assert_array_equal(kernel, weights["model.layers.1.mlp.down_proj.weight"].T)
+    first, last = (expected["decoder"][name]["mlp"]["down"]["kernel"] for name in ("layers", "last_layer"))
+    np.testing.assert_array_equal(first[0], weights["model.layers.0.mlp.down_proj.weight"].T)
+    np.testing.assert_array_equal(last, weights["model.layers.1.mlp.down_proj.weight"].T)
     patch = weights["visual.patch_embed.proj.weight"]
     np.testing.assert_array_equal(expected["vision"]["patch_embed"], patch.reshape(len(patch), -1).T)
     np.testing.assert_array_equal(expected["decoder"]["head"]["kernel"], weights["lm_head.weight"].T)
@@ -223,8 +226,10 @@ def test_index_must_be_one(tmp_path, content):
         load_params(tmp_path, CONFIG)
 
 
-def test_loaded_parameters_lie_on_the_asked_device(tmp_path, weights):
+def test_loaded_parameters_lie_where_they_are_asked_to(tmp_path, weights, expected):
     write_file(tmp_path / "model.safetensors", weights)
-    device = jax.devices("cpu")[0]
-    loaded = load_params(tmp_path, CONFIG, device=device)
-    assert {d for x in flax.traverse_util.flatten_dict(loaded).values() for d in x.devices()} == {device}
+    mesh = MeshConfig().build(jax.devices()[:1])
+    place = functools.partial(state_shardings, mesh)
+    loaded = load_params(tmp_path, CONFIG, jnp.float32, place)
+    assert jax.tree.map(lambda x: x.sharding, loaded) == place(loaded)
+    assert_equal(loaded, expected)

@@ -1,6 +1,7 @@
-"""Numbers that no command line means."""
+"""Numbers and files that no command line means."""
 
 import dataclasses
+import pathlib
 from typing import Any
 
 PORTS = 65_535
@@ -10,14 +11,16 @@ MOST = 1e15
 
 
 def require_possible(value: Any, where: str = "") -> None:
-    """Refuse numbers that are no quantity and ports that there are not, anywhere in a command's fields.
+    """Refuse numbers that are no quantity, ports that there are not, and paths of pipes and devices, in all fields.
+
+    A pipe or a device is read without end, or not at all, and an output is renamed onto its path.
 
     Args:
       value: the command, or one of its fields.
       where: name of the field.
 
     Raises:
-      ValueError: such a number.
+      ValueError: such a number or path.
     """
     if dataclasses.is_dataclass(value):
         for field in dataclasses.fields(value):
@@ -25,6 +28,8 @@ def require_possible(value: Any, where: str = "") -> None:
     elif isinstance(value, tuple):
         for each in value:
             require_possible(each, where)
+    elif isinstance(value, pathlib.Path) and value.exists() and not (value.is_file() or value.is_dir()):
+        raise ValueError(f"{where} is {value}: must be a file or a folder, not a pipe or a device; save what it gives")
     elif isinstance(value, float) and not abs(value) <= MOST:
         raise ValueError(f"{where} is {value}: must be a number within ±{MOST:g}; correct it")
     elif isinstance(value, int) and where.endswith("port") and not 0 <= value <= PORTS:

@@ -1,0 +1,136 @@
+"""Records as a tree of arrays, in a Zarr folder or an HDF5 file, and back without loss.
+
+    /                             attribute `touchr1`: JSON with source, licence, sensors and notes
+    /objects/<number>             attribute `plain`: JSON with object_id, labels, …;   view, view_depth_mm
+    /contacts/<number>/<sensor>   attribute `plain`: JSON with key, serial, camera, …;   the arrays of FRAME_ARRAYS
+    /backgrounds/<file>           bytes of the PNG files with the gel at rest
+
+Both libraries compress without loss; arrays have the types and units of `schema.FRAME_ARRAYS`.
+"""
+
+import pathlib
+from collections.abc import Callable, Iterator
+from typing import Any, Literal
+
+import numpy as np
+
+from sensors_io.contents import RESTS, rest_pictures
+from sensors_io.errors import MALFORMED, UserError
+from sensors_io.exporters.selection import (
+    ExportError,
+    Progress,
+    Selected,
+    card_of,
+    card_text,
+    library,
+    meta_of,
+    meta_text,
+    published,
+    sequence_of,
+    sequence_text,
+    write_back,
+)
+from sensors_io.schema import FRAME_ARRAYS, ObjectCard, Sequence
+
+Kind = Literal["zarr", "hdf5"]
+
+_META, _PLAIN, _VIEWS = "touchr1", "plain", ("view", "view_depth_mm")
+
+
+def export_arrays(selected: Selected, out: pathlib.Path, kind: Kind, progress: Progress) -> None:
+    """Write contacts as a tree of arrays, whole or not at all.
+
+    Raises:
+      ExportError: `out` exists, or the library is not installed.
+    """
+    with published(out) as temporary:
+        root, put, close = _created(temporary, kind)
+        try:
+            root.attrs[_META] = meta_text(selected.meta)
+            for number, card in enumerate(selected.cards()):
+                group = root.create_group(f"objects/{number:06d}")
+                group.attrs[_PLAIN] = card_text(card)
+                _put_all(group, put, {name: getattr(card, name) for name in _VIEWS})
+            rests = root.create_group(RESTS)
+            _put_all(rests, put, {n: np.frombuffer(x, np.uint8) for n, x in rest_pictures(selected.store.path).items()})
+            for number, contact in selected.contacts(progress):
+                for sensor, sequence in contact.items():
+                    group = root.create_group(f"contacts/{number:06d}/{sensor}")
+                    group.attrs[_PLAIN] = sequence_text(sequence)
+                    _put_all(group, put, {name: getattr(sequence, name) for name in FRAME_ARRAYS})
+        finally:
+            close()
+
+
+def import_arrays(path: pathlib.Path, out: pathlib.Path, progress: Progress) -> None:
+    """Write the records that `export_arrays` wrote to `path`.
+
+    Raises:
+      ExportError: it is no such export, it is damaged, or the library is not installed.
+      RecordsExistError: `out` holds other records.
+    """
+    root, close = _opened(path)
+    try:
+        meta = meta_of(str(root.attrs[_META]), path)
+        numbers, done = sorted(root["contacts"]), 0
+
+        def one_more() -> None:
+            nonlocal done
+            done += 1
+            progress(done, len(numbers))
+
+        contacts = (_contact(root["contacts"][number], meta.sensors) for number in numbers)
+        rests = {name: root[RESTS][name][...].tobytes() for name in root[RESTS]}
+        write_back(meta, _cards(root), contacts, rests, out, one_more)
+    except UserError:
+        raise
+    except MALFORMED as error:
+        raise ExportError(f"{path} is no export of records, or damaged ({error!r}); export them again") from error
+    finally:
+        close()
+
+
+def _cards(root: Any) -> Iterator[ObjectCard]:
+    for name in sorted(root["objects"]):
+        group = root["objects"][name]
+        yield card_of(str(group.attrs[_PLAIN]), {view: group[view][...] for view in _VIEWS if view in group})
+
+
+def _contact(group: Any, sensors: tuple[str, ...]) -> list[Sequence]:
+    found = []
+    for sensor in sensors:
+        if sensor in group:
+            one = group[sensor]
+            arrays = {name: np.asarray(one[name][...]) for name in FRAME_ARRAYS if name in one}
+            found.append(sequence_of(str(one.attrs[_PLAIN]), arrays))
+    return found
+
+
+def _put_all(group: Any, put: Callable[[Any, str, np.ndarray], object], arrays: dict[str, np.ndarray | None]) -> None:
+    for name, array in arrays.items():
+        if array is not None:
+            put(group, name, np.ascontiguousarray(array))
+
+
+def _created(path: pathlib.Path, kind: Kind) -> tuple[Any, Callable[[Any, str, np.ndarray], object], Callable[[], Any]]:
+    """A new tree, the function that adds an array to a group of it, and the one that closes it."""
+    if kind == "zarr":
+        zarr = library("zarr", "zarr")
+        whole = lambda group, name, x: group.create_array(name, data=x, chunks=x.shape or "auto")
+        return zarr.create_group(store=str(path), zarr_format=3), whole, lambda: None
+    file = library("h5py", "hdf5").File(path, "w", libver="latest")  # attributes larger than 64 kB
+    squeezed = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+    return file, lambda group, name, x: group.create_dataset(name, data=x, **squeezed if x.ndim else {}), file.close
+
+
+def _opened(path: pathlib.Path) -> tuple[Any, Callable[[], Any]]:
+    """A tree to read, and the function that closes it."""
+    try:
+        if path.is_dir():
+            return library("zarr", "zarr").open_group(store=str(path), mode="r"), lambda: None
+        file = library("h5py", "hdf5").File(path, "r")
+    except ExportError:
+        raise
+    except (OSError, *MALFORMED) as error:
+        raise ExportError(f"{path} does not open as Zarr or HDF5 ({error!r}); export the records again") from error
+    return file, file.close

@@ -1,0 +1,27 @@
+"""Records back from an export, whichever format it has."""
+
+import pathlib
+
+from sensors_io.exporters.arrays import import_arrays
+from sensors_io.exporters.lerobot import OURS, import_lerobot
+from sensors_io.exporters.selection import ExportError, Progress
+
+
+def import_exported(path: pathlib.Path, out: pathlib.Path, progress: Progress) -> None:
+    """Write the records that `export` wrote to a LeRobotDataset, a Zarr folder or an HDF5 file.
+
+    Args:
+      path: of the export.
+      out: directory of the records; an interrupted import goes on.
+      progress: called with the number of contacts done and their total.
+
+    Raises:
+      ExportError: it is no export of records, or damaged, or a library is not installed.
+      RecordsExistError: `out` holds other records.
+    """
+    if not path.exists():
+        raise ExportError(f"{path} does not exist: must be a folder or file that `export` wrote; correct the path")
+    if (path / OURS).is_dir():
+        import_lerobot(path, out, progress)
+    else:
+        import_arrays(path, out, progress)

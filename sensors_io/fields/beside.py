@@ -1,0 +1,156 @@
+"""Fields beside the pictures of records: new records with both, a unit for each shard, resumed where it stopped."""
+
+import dataclasses
+import functools
+import hashlib
+import json
+import pathlib
+from collections.abc import Callable, Iterator
+
+from sensors_io.contents import put_rest_pictures, rest_pictures
+from sensors_io.fields.extract import ExtractConfig
+from sensors_io.fields.recorded import RecordedGels, RestGel, with_fields
+from sensors_io.fields.types import Calibration, CalibrationError
+from sensors_io.index import RecordsMeta
+from sensors_io.parts import make_part, part_path, write_by_units
+from sensors_io.records import RecordStore
+from sensors_io.schema import Sequence
+from sensors_io.shards import shard_file
+from sensors_io.units import HERE, Launcher, WorkUnit
+
+FRAMES_PER_SHARD = 2880
+"""At the several hundred pictures a second of one core, a killed extraction loses some seconds."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FieldsJob:
+    """Everything that decides the fields of some records.
+
+    Args:
+      records: whose pictures are read.
+      sensor: whose pictures are read; sequences of other sensors are copied as they are.
+      gel: at rest, where a recording has none of its own.
+      calibration: of the colours; `None` gives neither depth nor shear.
+      config: of the extraction.
+      rows: of the fields; 0 takes those of the pictures.
+    """
+
+    records: pathlib.Path
+    sensor: str
+    gel: RestGel
+    calibration: Calibration | None
+    config: ExtractConfig
+    rows: int = 0
+
+    def __post_init__(self) -> None:
+        if self.rows < 0:
+            raise CalibrationError(f"rows is {self.rows}: must be ≥ 0; 0 takes the rows of the pictures")
+        if self.calibration is not None and self.calibration.sensor != self.sensor:
+            raise CalibrationError(
+                f"calibration is for {self.calibration.sensor!r}, not {self.sensor!r}: must be equal; set --sensor"
+            )
+
+    def hash(self, digest: str) -> str:
+        """First 16 hex digits of the SHA-256 of the job and of the digest of its records."""
+        background = b"" if self.gel.background is None else self.gel.background.tobytes()
+        made_by = "" if self.calibration is None else self.calibration.hash
+        said = [digest, self.sensor, made_by, self.gel.rest_frames, self.gel.mm_per_px, self.rows]
+        text = json.dumps([*said, dataclasses.asdict(self.config)], default=str)
+        return hashlib.sha256(text.encode() + background).hexdigest()[:16]
+
+
+def fields_beside(
+    job: FieldsJob,
+    out: pathlib.Path,
+    *,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    frames_per_shard: int = FRAMES_PER_SHARD,
+    launcher: Launcher = HERE,
+) -> None:
+    """Write records with the fields beside the pictures in `out`; contacts that are there already are kept.
+
+    Args:
+      job: what is extracted.
+      out: directory of the new records, which all workers see.
+      progress: called with the number of contacts done and their total.
+      frames_per_shard: frames of all sensors in one file.
+      launcher: where shards are made; the records do not depend on it.
+
+    Raises:
+      CalibrationError: no sequence of the sensor, `out` is where the records are, or the first sequence cannot be read.
+      RecordsExistError: `out` holds other records.
+      LauncherError, UnitsError: as `units.finish`.
+    """
+    store = RecordStore(job.records)
+    if out.absolute() == job.records.absolute():
+        raise CalibrationError(f"--out is {out}: must not be the records themselves; name another directory")
+    _try_first(store, job)
+    meta = RecordsMeta(
+        source=store.meta.source,
+        licence=store.meta.licence,
+        config_hash=job.hash(store.digest),
+        sensors=store.meta.sensors,
+        notes={**store.meta.notes, "fields": {"of": job.sensor, "records": store.digest, "rows": job.rows}},
+    )
+    each = max(1, round(sum(store.frames.values()) / max(len(store), 1)))
+    per_shard = max(1, frames_per_shard // each)
+
+    def units_from(contacts: int, shards: int) -> list[WorkUnit]:
+        units = []
+        for number, first in enumerate(range(contacts, len(store), per_shard), shards):
+            last = min(first + per_shard, len(store))
+            digest = hashlib.sha256(f"{meta.config_hash} {number} {first} {last}".encode()).hexdigest()[:16]
+            name = f"{pathlib.Path(shard_file('contacts', number)).stem}.{digest}"
+            run = functools.partial(extract_shard, job, out.absolute(), number, first, last, name)
+            units.append(WorkUnit(name=name, run=run, done=part_path(out.absolute(), name).exists))
+        return units
+
+    put_rest_pictures(out, rest_pictures(store.path))
+    cards = store.objects.values()
+    write_by_units(out, meta, cards, units_from, launcher, lambda done: progress(done, len(store)))
+
+
+def extract_shard(job: FieldsJob, out: pathlib.Path, number: int, first: int, last: int, name: str) -> None:
+    """Write the shard of the contacts from `first` on, before `last`, then the part that describes it."""
+    store = RecordStore(job.records)
+    gels = RecordedGels(store.path, job.gel, job.calibration, job.config)
+
+    def contacts() -> Iterator[list[Sequence]]:
+        for i in range(first, last):
+            yield [_extracted(sequence, job, gels) for sequence in store.contact(i).values()]
+
+    make_part(out, number, store.meta.sensors, contacts(), part_path(out, name))
+
+
+def _extracted(sequence: Sequence, job: FieldsJob, gels: RecordedGels) -> Sequence:
+    if sequence.sensor != job.sensor:
+        return sequence
+    _require_readable(sequence, gels)
+    fields, _ = gels.fields(sequence)
+    return with_fields(sequence, fields, "" if job.calibration is None else job.calibration.hash, job.rows)
+
+
+def _require_readable(sequence: Sequence, gels: RecordedGels) -> None:
+    have = [name for name in ("depth_mm", "deformation_mm", "shear_mm") if getattr(sequence, name) is not None]
+    if have:
+        raise CalibrationError(
+            f"{sequence.name} has {', '.join(have)} already: must have pictures alone; extract other records"
+        )
+    if problem := gels.problem(sequence):
+        raise CalibrationError(f"{sequence.name} cannot be read: {problem}")
+
+
+def _try_first(store: RecordStore, job: FieldsJob) -> None:
+    """Refuse what cannot be read before anything is written."""
+    seen = (i for i in range(len(store)) if job.sensor in store.sensors_of(i))
+    first = next(seen, None)
+    if first is None:
+        raise CalibrationError(
+            f"--sensor is {job.sensor!r}: must be one of the records', {', '.join(store.meta.sensors)}; correct it"
+        )
+    sequence = store.contact(first)[job.sensor]
+    gels = RecordedGels(store.path, job.gel, job.calibration, job.config)
+    _require_readable(sequence, gels)
+    refused = gels.extractor(sequence).refused
+    if job.calibration is None and len(refused) > 1:
+        raise CalibrationError(f"{sequence.name} carries no field: {'; '.join(refused)}")

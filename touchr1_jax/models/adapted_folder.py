@@ -1,0 +1,236 @@
+"""A policy on released weights as a folder that describes itself, small beside the weights that it refers to.
+
+DIR/config.json                 sizes, sensors, prompt, frames that it reads, where the released weights are, checksums
+DIR/adapter_config.json         adapters in PEFT's format,
+DIR/adapter_model.safetensors   which `peft` loads on the same weights
+DIR/touch_encoder.safetensors   tactile encoder and the projection of its tokens
+DIR/README.md                   model card
+"""
+
+import dataclasses
+import os
+import shutil
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import traverse_util
+
+from touchr1_jax.models.load import Checkpoint, load_checkpoint
+from touchr1_jax.models.lora import exported, kept_share
+from touchr1_jax.models.qwen.config import CONFIG_FILE
+from touchr1_jax.models.qwen.peft import PEFT_CONFIG, PEFT_WEIGHTS, load_adapters, save_adapters
+from touchr1_jax.models.qwen.safetensors import ReportBytes, read_header, read_tensor, write_file
+from touchr1_jax.models.qwen.weights import INDEX, SINGLE, save_params
+from touchr1_jax.models.released_policy import ReleasedModel, ReleasedPolicy, build_released_policy, instruction
+from touchr1_jax.models.saved_policy import (
+    CARD,
+    PolicyError,
+    PolicyInput,
+    SavedPolicy,
+    default_card,
+    digest_of,
+    format_of,
+    read_policy,
+    read_sealed,
+    rebuilt,
+    seal,
+)
+from touchr1_jax.models.stacked import ADAPTERS
+from touchr1_jax.models.touch_policy import with_lora
+from touchr1_jax.types import Params
+
+ADAPTED, VERSION = "touchr1-adapted", 1
+TOUCH_FILE = "touch_encoder.safetensors"
+COPIED = (".json", ".jinja", ".txt", ".md")
+"""Endings of the small files of a released folder, which an export copies."""
+
+SILENT: ReportBytes = lambda done_bytes, all_bytes: None
+
+
+def save_adapted(folder: Path, saved: SavedPolicy, weights: str) -> None:
+    """Publish a policy as a folder in one move; one that is there is replaced.
+
+    Args:
+      folder: where.
+      saved: a policy on released weights, with adapters.
+      weights: path of the released folder, absolute or from `folder` on.
+    """
+    policy = saved.policy
+    assert isinstance(policy, ReleasedPolicy)
+    unfinished = folder.with_name(f".{folder.name}.{os.getpid()}")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    unfinished.mkdir(parents=True)
+    adapters = of_checkpoint(saved.params.get(ADAPTERS, {}))
+    save_adapters(unfinished, adapters, policy.checkpoint.config, policy.fns.lora, weights)
+    write_file(unfinished / TOUCH_FILE, touch_tensors(saved.params))
+    (unfinished / CARD).write_text(default_card(saved, "float32"), encoding="utf-8")
+    fields: dict[str, Any] = {
+        "model_type": ADAPTED,
+        "version": VERSION,
+        "weights": {"folder": weights, "files": file_marks(policy.checkpoint.directory)},
+        "sensors": saved.sensors,
+        "model": dataclasses.asdict(policy.model),
+        "lora": dataclasses.asdict(policy.fns.lora),
+        "prompt": instruction(policy.language),
+        "questions": dict(saved.questions),
+        "input": dataclasses.asdict(saved.reads),
+        "notes": dict(saved.notes),
+        "files": {name: digest_of(unfinished / name) for name in (PEFT_CONFIG, PEFT_WEIGHTS, TOUCH_FILE)},
+    }
+    (unfinished / CONFIG_FILE).write_text(seal(fields), encoding="utf-8")
+    shutil.rmtree(folder, ignore_errors=True)
+    unfinished.rename(folder)
+
+
+def read_adapted(
+    folder: Path, weights: Path | None = None, found: Checkpoint | None = None, progress: ReportBytes = SILENT
+) -> SavedPolicy:
+    """The policy of a folder that `save_adapted` wrote.
+
+    Args:
+      folder: of the policy.
+      weights: of the released model, where that is no longer where it was.
+      found: the released model, where it was read already.
+      progress: told of the weights as `load_params` tells.
+
+    Raises:
+      PolicyError: a damaged folder, one of another version, or released weights that are missing or others.
+      WeightsError, OSError: as `load_checkpoint`.
+    """
+    config = read_sealed(folder, ADAPTED, VERSION)
+    try:
+        for name, digest in config["files"].items():
+            if not (folder / name).is_file() or digest_of(folder / name) != digest:
+                raise PolicyError(f"policy is {folder}: {name} is missing or damaged; copy the folder again")
+        released = weights or Path(os.path.normpath(folder / config["weights"]["folder"]))
+        if not released.is_dir():
+            raise PolicyError(
+                f"policy is {folder}: its released weights are not in {released}; say where by --weights DIR"
+            )
+        require_marks(folder, released, config["weights"]["files"])
+        model = rebuilt(ReleasedModel, config["model"])
+        found = found or load_checkpoint(released, jnp.dtype(model.dtype), progress)
+        adapters, lora = load_adapters(folder, found.config)
+        policy = build_released_policy(_without_sensors(model), found, tuple(config["sensors"]))
+        lora = dataclasses.replace(rebuilt(type(lora), config["lora"]), rank=lora.rank, alpha=lora.alpha)
+        if instruction(policy.language) != config["prompt"]:
+            raise PolicyError(f"policy is {folder}: prompt differs from this version's; use the version that wrote it")
+        reads = rebuilt(PolicyInput, config["input"])
+    except (KeyError, TypeError, AttributeError) as error:
+        raise PolicyError(f"policy is {folder}: its config does not fit ({error}); save it anew") from error
+    params: Params = {**read_touch(folder), "vision": {"tower": found.params["vision"]}, ADAPTERS: of_policy(adapters)}
+    params["decoder"] = found.params["decoder"]
+    policy = with_lora(policy, lora)
+    return SavedPolicy(policy=policy, params=params, reads=reads, notes=config["notes"], questions=config["questions"])
+
+
+def read_saved(folder: Path, weights: Path | None = None) -> SavedPolicy:
+    """A policy of either format.
+
+    Raises:
+      PolicyError, WeightsError: as `read_policy` and `read_adapted`, or weights for a policy that has its own.
+    """
+    if format_of(folder) == ADAPTED:
+        return read_adapted(folder, weights)
+    if weights is not None:
+        raise PolicyError(f"weights are {weights}: must be left out for {folder}, a policy with weights of its own")
+    return read_policy(folder)
+
+
+def export_merged(folder: Path, saved: SavedPolicy, dtype: jnp.dtype, progress: ReportBytes = SILENT) -> float:
+    """Write the released folder with the adapters merged into its weights, and the touch encoder beside them.
+
+    Args:
+      folder: new, or empty.
+      saved: a policy on released weights.
+      dtype: of the weights; float32 keeps every change, bfloat16 what is larger than its rounding.
+      progress: called after each tensor.
+
+    Returns:
+      The share of the adapters' change that the written weights keep.
+
+    Raises:
+      PolicyError: the folder holds something already.
+    """
+    policy = saved.policy
+    assert isinstance(policy, ReleasedPolicy)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise PolicyError(f"folder is {folder}: it exists and is not empty; choose a new one")
+    folder.mkdir(parents=True, exist_ok=True)
+    base = {name: jax.tree.map(lambda x: x.astype(dtype), saved.params[name]) for name in ("decoder", "vision")}
+    whole = exported({**base, ADAPTERS: saved.params[ADAPTERS]}, policy.fns.lora)
+    for path in sorted(policy.checkpoint.directory.iterdir()):
+        if path.is_file() and path.suffix in COPIED and path.name != INDEX:
+            shutil.copy(path, folder)
+    merged = {"vision": whole["vision"]["tower"], "decoder": whole["decoder"]}
+    save_params(folder / SINGLE, merged, policy.checkpoint.config, progress)
+    write_file(folder / TOUCH_FILE, touch_tensors(saved.params))
+    return kept_share(base, whole, saved.params[ADAPTERS], policy.fns.lora)
+
+
+def of_checkpoint(adapters: Params) -> Params:
+    """Adapters nested as `QwenVL`, whose vision tower a policy has one level deeper."""
+    return {name: tree["tower"] if name == "vision" else tree for name, tree in adapters.items()}
+
+
+def of_policy(adapters: Params) -> Params:
+    """Inverse of `of_checkpoint`."""
+    return {name: {"tower": tree} if name == "vision" else tree for name, tree in adapters.items()}
+
+
+def touch_tensors(params: Params) -> dict[str, np.ndarray]:
+    """What is neither released nor an adapter, by dotted names."""
+    own = {name: tree for name, tree in params.items() if name not in ("vision", "decoder", ADAPTERS)}
+    return {name: np.asarray(x) for name, x in traverse_util.flatten_dict(own, sep=".").items()}
+
+
+def read_touch(folder: Path) -> Params:
+    """The tactile encoder and its projection.
+
+    Raises:
+      PolicyError: numbers that are not finite.
+    """
+    flat = {name: read_tensor(entry) for name, entry in read_header(folder / TOUCH_FILE).items()}
+    infinite = sorted(name for name, x in flat.items() if not np.isfinite(x).all())
+    if infinite:
+        raise PolicyError(f"policy is {folder}: {infinite[0]} of {TOUCH_FILE} holds NaN or infinity; train it again")
+    return traverse_util.unflatten_dict({name: jnp.asarray(x) for name, x in flat.items()}, sep=".")
+
+
+def file_marks(directory: Path) -> dict[str, list[int]]:
+    """Fingerprint of every file of a folder."""
+    return {path.name: fingerprint(path) for path in sorted(directory.iterdir()) if path.is_file()}
+
+
+def fingerprint(path: Path) -> list[int]:
+    """Size of a file and the CRC-32 of its first and of its last mebibyte: shards of gigabytes are not read twice."""
+    size, ends = path.stat().st_size, []
+    with path.open("rb") as file:
+        for start in (0, max(0, size - 2**20)):
+            file.seek(start)
+            ends.append(zlib.crc32(file.read(2**20)))
+    return [size, *ends]
+
+
+def require_marks(folder: Path, released: Path, marks: Mapping[str, list[int]]) -> None:
+    """Refuse released weights that are not those that a policy was trained on.
+
+    Raises:
+      PolicyError: naming the files that differ.
+    """
+    here = file_marks(released)
+    changed = sorted(name for name, mark in marks.items() if here.get(name) != list(mark))
+    if changed:
+        raise PolicyError(
+            f"policy is {folder}: {', '.join(changed)} in {released} are not what it was trained on; give its own "
+            "weights by --weights DIR"
+        )
+
+
+def _without_sensors(model: ReleasedModel) -> ReleasedModel:
+    return dataclasses.replace(model, tactile=dataclasses.replace(model.tactile, sensors=0))

@@ -1,0 +1,139 @@
+"""Adapters in the format of Hugging Face's PEFT: `adapter_config.json` beside `adapter_model.safetensors`."""
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from touchr1_jax.models.lora import Adapter, Adapters, LoraConfig, by_layer, nested
+from touchr1_jax.models.qwen import names
+from touchr1_jax.models.qwen.config import QwenConfig
+from touchr1_jax.models.qwen.safetensors import read_header, read_tensor, write_file
+
+PEFT_CONFIG, PEFT_WEIGHTS = "adapter_config.json", "adapter_model.safetensors"
+PREFIX = "base_model.model."
+FACTORS = {"a": "lora_A", "b": "lora_B"}
+"""Our factors, [in, r] and [r, out], and PEFT's, which are turned."""
+
+REFUSED = {"bias": "none", "use_dora": False, "fan_in_fan_out": False, "modules_to_save": None, "rank_pattern": {}}
+"""Fields of a config and the values without which adapters compute something else than here."""
+
+
+def save_adapters(folder: Path, adapters: Adapters, config: QwenConfig, lora: LoraConfig, base: str) -> None:
+    """Write adapters so that PEFT reads them, in float32.
+
+    Args:
+      folder: that exists.
+      adapters: nested as the parameters of `QwenVL`.
+      config: shapes of the model that they belong to.
+      lora: as they were trained.
+      base: name of the folder of the released weights, for PEFT.
+    """
+    tensors: dict[str, np.ndarray] = {}
+    found = by_layer(adapters)
+    for s in names.sources(config).values():
+        adapter = found.get(s.path[:-1]) if s.path[-1] == "kernel" else None
+        for name, factor in () if adapter is None else adapter._asdict().items():
+            of_layer = np.asarray(factor if s.row is None else factor[s.row], np.float32)
+            tensors[f"{PREFIX}{module_of(s.key)}.{FACTORS[name]}.weight"] = of_layer.T
+    write_file(folder / PEFT_WEIGHTS, tensors)
+    fields = {
+        "peft_type": "LORA",
+        "task_type": None,
+        "base_model_name_or_path": base,
+        "r": lora.rank,
+        "lora_alpha": lora.alpha,
+        "use_rslora": lora.rank_stabilised,
+        "target_modules": target_pattern(lora),
+        "lora_dropout": 0.0,
+        "inference_mode": True,
+        **REFUSED,
+    }
+    (folder / PEFT_CONFIG).write_text(json.dumps(fields, indent=2) + "\n", encoding="utf-8")
+
+
+def load_adapters(folder: Path, config: QwenConfig) -> tuple[Adapters, LoraConfig]:
+    """Adapters that PEFT or `save_adapters` wrote, and their config.
+
+    Raises:
+      FileNotFoundError: a file is missing.
+      ValueError: adapters of another kind or of another model, or NaN or infinity; the message names the first misfit.
+    """
+    for name in (PEFT_CONFIG, PEFT_WEIGHTS):
+        if not (folder / name).is_file():
+            raise FileNotFoundError(f"{folder / name} is no file: must be a part of saved adapters; correct the folder")
+    fields = json.loads((folder / PEFT_CONFIG).read_text(encoding="utf-8"))
+    lora = read_lora(fields, folder / PEFT_CONFIG)
+    entries = {_canonical(key): entry for key, entry in read_header(folder / PEFT_WEIGHTS).items()}
+    layers: dict[names.Path, dict[int | None, Adapter]] = {}
+    for s in names.sources(config).values():
+        keys = [f"{s.key.removesuffix('.weight')}.{FACTORS[name]}.weight" for name in ("a", "b")]
+        if not any(key in entries for key in keys):
+            continue
+        out, inp = s.shape
+        factors: list[Any] = []
+        for key, shape in zip(keys, ((lora.rank, inp), (out, lora.rank)), strict=True):
+            if key not in entries or entries[key].shape != shape:
+                told = entries[key].shape if key in entries else "missing"
+                raise ValueError(f"{folder / PEFT_WEIGHTS}: {key} is {told}: must be {shape} of rank {lora.rank}")
+            factors.append(read_tensor(entries.pop(key)).astype(np.float32).T)
+            if not np.isfinite(factors[-1]).all():
+                raise ValueError(f"{folder / PEFT_WEIGHTS}: {key} holds NaN or infinity; its training diverged")
+        layers.setdefault(s.path[:-1], {})[s.row] = Adapter(*factors)
+    if entries:
+        raise ValueError(f"{folder / PEFT_WEIGHTS}: {min(entries)} belongs to no layer of the base; take its own base")
+    return nested({path: _stacked(path, rows, config) for path, rows in layers.items()}), lora
+
+
+def read_lora(fields: Mapping[str, Any], where: Path) -> LoraConfig:
+    """The config of adapters, without their targets, which the tensors name.
+
+    Raises:
+      ValueError: another kind of adapters.
+    """
+    wanted = {"peft_type": "LORA", **REFUSED}
+    odd = [name for name, value in wanted.items() if (fields.get(name, value) or None) != (value or None)]
+    if odd:
+        raise ValueError(f"{where}: {odd[0]} is {fields[odd[0]]!r}: must be {wanted[odd[0]]!r}; nothing else is read")
+    rank, alpha = fields.get("r"), fields.get("lora_alpha")
+    if type(rank) is not int or rank < 1 or not isinstance(alpha, int | float):
+        raise ValueError(f"{where}: r is {rank!r} and lora_alpha {alpha!r}: must be numbers above 0; correct them")
+    return LoraConfig(rank=rank, alpha=float(alpha), rank_stabilised=bool(fields.get("use_rslora")))
+
+
+def target_pattern(lora: LoraConfig) -> str:
+    """Regular expression of the adapted modules' names: MLPs of both towers have layers of one name."""
+    named = lambda layers: "|".join(re.escape(names.MODULES.get(x, x)) for x in layers)
+    kinds = [rf"(?!.*visual\.).*\.({named(lora.targets)})"] if lora.targets else []
+    kinds += [rf".*visual\.(.*\.)?({named(lora.vision_targets)})"] if lora.vision_targets else []
+    return "|".join(kinds)
+
+
+def module_of(key: str) -> str:
+    """A key of `names.sources` as the module of transformers ≥ 4.52."""
+    module = key.removesuffix(".weight")
+    return f"model.language_model.{module.removeprefix('text.')}" if module.startswith("text.") else f"model.{module}"
+
+
+def _canonical(key: str) -> str:
+    """A key of PEFT as `names.sources` has it, with the factor at its end."""
+    return names.canonical(key.removeprefix(PREFIX).replace(".default.", "."))
+
+
+def _stacked(path: names.Path, rows: Mapping[int | None, Adapter], config: QwenConfig) -> Adapter:
+    """The adapters of a stack of layers.
+
+    Raises:
+      ValueError: some layers have none.
+    """
+    if None in rows:
+        return Adapter(*map(jnp.asarray, rows[None]))
+    count = config.decoder.num_layers - 1 if path[0] == "decoder" else config.vision.depth
+    lacking = sorted(set(range(count)) - rows.keys())
+    if lacking:
+        raise ValueError(f"layer {lacking[0]} has no adapter of {path[-1]}: must have one where another layer has")
+    return Adapter(*(jnp.stack([rows[i][f] for i in range(count)]) for f in range(2)))
