@@ -11,9 +11,9 @@ half the probability of each level given what people said of the object (trainin
 kept learns from all labelled objects; `--predict` answers with it, in words with probabilities: a folder of videos one
 by one, several named videos also together, as touches of one object.
 
-About 12 minutes on one core for scenes, descriptions and one partition, of which eight need 10 minutes more (`smoke`
-half a minute).  Expected: all three right of 44 % of the videos, 72 % of the levels, .32 levels off from one video, 50 %,
-76 % and .27 from all of an object; people agree with 75 to 79 % of the labels that they rated.
+Under a load of 15 on two cores: 30 minutes for scenes, once, 15 for the rest (`smoke` half a minute).  Expected: all
+three right of 44 % of the videos, 72 % of the levels, .32 levels off from one video, 50 %, 76 % and .27 from all of an
+object; people agree with 75 to 79 % of the labels that they rated.
 """
 
 import dataclasses
