@@ -149,8 +149,9 @@ def confusions(answers: Answers) -> Picture:
 
 def abstention(answers: Answers) -> Picture:
     """Scores over the share of the videos that is answered, and how often a stated probability comes true."""
-    at = [100 * share for share in SHARES]
-    found = [answers.of_surest(share) for share in SHARES]
+    shares = [share for share in SHARES if len(np.unique(answers.owner[answers.surest(share)])) > 1]  # for intervals
+    at = [100 * share for share in shares]
+    found = [answers.of_surest(share) for share in shares]
     series = [estimates(name, [one[name] for one in found], at=at, band=True) for name in ("all right", "mean")]
     axes: dict[str, Any] = {"x_label": "videos answered, the surest first (%)", "y_label": "right (%)"}
     panels = [Panel(series, title="Abstention", x_limits=(0, 105), y_limits=(0, 100), **axes)]
