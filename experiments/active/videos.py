@@ -27,7 +27,7 @@ from experiments.recordings.descriptions import SENSOR, DescribedVideos, describ
 from sensors_io.touches import families
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
 from touchr1_jax.models.active_policy import ActivePolicy, build_active_policy
-from touchr1_jax.models.description_policy import LANGUAGE
+from touchr1_jax.models.description_policy import LANGUAGE, LEVELS
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.rl.config import GRPOConfig, Norm, Paper
 from touchr1_jax.rl.environment import TouchBank, TouchChoice
@@ -136,7 +136,7 @@ def bank_of(world: VideoWorld, tested: Int[np.ndarray, "n"], seed: int) -> Touch
     label = np.repeat(world.label, videos, 0)
     weight = object_weights(owner, ~np.isin(owner, tested))
     flat = world.x.reshape(len(owner), -1).astype(np.float64)
-    found = cross_probe(flat, label, weight, owner, np.array(families()), READERS, seed).mean(1)
+    found = cross_probe(flat, np.eye(LEVELS)[label], weight, owner, np.array(families()), READERS, seed).mean(1)
     belief = np.log(found).reshape(objects, videos, *found.shape[1:]).astype(np.float32)
     shape = (objects, videos)
     return TouchBank(

@@ -1,29 +1,26 @@
-"""Cross-validation over objects: folds, baselines, scores, the contribution of each part, and limits of the answers."""
+"""Cross-validation over objects: folds, answers of policies and probes, several videos as one, scores."""
 
 import dataclasses
 import hashlib
-import math
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
 from experiments.core.results import Cell, Table, named_table
 from experiments.recordings.descriptions import AuxiliaryData, DescribedVideos
-from experiments.recordings.learning import LearnConfig, answer_log_probs, learn, probe_answers
-from experiments.recordings.level_probes import SCENES
+from experiments.recordings.learning import LearnConfig, answer_log_probs, learn, probe_probabilities
+from experiments.recordings.level_probes import GROUPS, READINGS, SCENES
 from sensors_io.touches import families
 from touchr1_jax.bench.metrics import Scores, accuracy, mean_accuracy, ordinal_mae
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
-from touchr1_jax.models.description_policy import COMBINATIONS, LANGUAGE, LEVELS, choose
-from touchr1_jax.training.description_tuning import ReinforceConfig
-from touchr1_jax.training.kernel_probe import object_weights, standardise
+from touchr1_jax.models.description_policy import COMBINATIONS, LANGUAGE, LEVELS, choose, utility
+from touchr1_jax.training.kernel_probe import standardise
 
-SHARES = (0.25, 0.5, 0.75, 1.0)  # of the training objects, that the probes learn from
-
+SHARPNESS = 3.0  # power of a probe's probabilities: ridge regression shrinks them, as `reading_lesson` says
 
 SCORES: Mapping[str, str] = {
     "all right": "videos of which hardness, roughness and bumps are all answered right",
@@ -52,18 +49,6 @@ def deal_folds(objects: np.ndarray, label: Int[np.ndarray, "n A"], count: int, s
     order = sorted(range(len(names)), key=lambda i: (tuple(label[first[i]]), digest[i]))
     fold = {names[i]: place % count for place, i in enumerate(order)}
     return np.array([fold[name] for name in objects])
-
-
-def constants(label: np.ndarray, objects: np.ndarray, fold: np.ndarray) -> dict[str, Int[np.ndarray, "n A"]]:
-    """Answers without touch: per attribute and joint mode of the training objects of each fold."""
-    answers = {name: np.zeros_like(label) for name in ("constant, each attribute's mode", "constant, joint mode")}
-    for k in np.unique(fold):
-        weight = object_weights(objects, fold != k)
-        each = [np.bincount(label[:, a], weight, LEVELS).argmax() for a in range(label.shape[1])]
-        joint = np.bincount((label * LEVELS ** np.arange(label.shape[1])[::-1]).sum(1), weight, len(COMBINATIONS))
-        for rows, level in zip(answers.values(), (each, COMBINATIONS[joint.argmax()]), strict=True):
-            rows[fold == k] = level
-    return answers
 
 
 def scores(answer: Int[np.ndarray, "n A"], label: Int[np.ndarray, "n A"]) -> dict[str, Scores]:
@@ -95,6 +80,7 @@ class CrossValidation:
       videos: labelled videos.
       auxiliary: scenes and unlabelled videos.
       fold: of each video, int [n]; all videos of an object are in one.
+      seed: of the partition, and of what is trained on it.
       context: keeps finished folds, log and times.
     """
 
@@ -102,102 +88,105 @@ class CrossValidation:
     videos: DescribedVideos
     auxiliary: AuxiliaryData
     fold: np.ndarray
+    seed: int
     context: Context
 
-    def policy_answers(self, config: LearnConfig, seed: int, stage: str) -> Int[np.ndarray, "n A"]:
-        """Answers about every video by a policy that never met its object; finished folds are not repeated."""
-        answers = np.zeros_like(self.videos.label)
-        for k in self.context.each(stage, np.unique(self.fold)):
-            out, name = self.fold == k, f"{stage}/{k}"
-            if not self.context.done(name):
-                trained = learn(config, self.videos.rows(~out), self.auxiliary, seed, self.context, name)
-                self.context.save_stage(name, choose(answer_log_probs(trained, self.videos.rows(out))).tolist())
-            answers[out] = self.context.load_stage(name)
-        return answers
+    def policy(self, config: LearnConfig, stage: str, *, together: bool = False) -> Float[np.ndarray, "n 27"]:
+        """Log-probabilities of the answers about every video by a policy that never met its object.
 
-    def probe_answers(
-        self, config: LearnConfig, auxiliary: AuxiliaryData, share: float = 1.0
-    ) -> Int[np.ndarray, "n A"]:
-        """Answers of the probes alone, each fold read by probes on a share of the objects of the other folds."""
-        videos, answers = self.videos, np.zeros_like(self.videos.label)
+        Finished folds are not repeated.  With `together`, each prompt holds all videos of the object.
+        """
+        found = np.zeros((len(self.videos.names), len(COMBINATIONS)))
+        for k in self.context.each(stage, np.unique(self.fold)):
+            out, name = self.fold == k, f"{stage}/{self.seed}/{k}"
+            if not self.context.done(name):
+                trained = learn(config, self.videos.rows(~out), self.auxiliary, self.seed, self.context, name)
+                read = self.videos.rows(out)
+                asked = [np.flatnonzero(read.objects == owner) for owner in read.objects] if together else None
+                self.context.save_stage(name, answer_log_probs(trained, read, asked).tolist())
+            found[out] = self.context.load_stage(name)
+        return found
+
+    def probes(
+        self, config: LearnConfig | None = None, auxiliary: AuxiliaryData | None = None, objects: int | None = None
+    ) -> Float[np.ndarray, "n 27"]:
+        """As `policy`, by probes alone that learn from so many of the objects of the other folds, all by default."""
+        videos, found = self.videos, np.zeros((len(self.videos.names), len(COMBINATIONS)))
         for k in self.context.each("probes", np.unique(self.fold)):
             names = np.unique(videos.objects[self.fold != k])
-            kept = np.random.default_rng(0).permutation(names)[: max(1, round(share * len(names)))]
+            kept = np.random.default_rng(0).permutation(names)[:objects]
             training, out = videos.rows(np.isin(videos.objects, kept)), self.fold == k
-            answers[out] = probe_answers(config, training, auxiliary, videos.rows(out))
-        return answers
+            p = probe_probabilities(config or self.config, training, auxiliary or self.auxiliary, videos.rows(out))
+            found[out] = joint_log_prob(p)
+        return found
 
-    def growth(self) -> dict[int, dict[str, Interval]]:
-        """Scores of the probes by the number of objects that they learn from."""
-        videos = self.videos
-        objects = np.mean([len(np.unique(videos.objects[self.fold != k])) for k in np.unique(self.fold)])
-        return {
-            round(share * objects): intervals(
-                self.probe_answers(self.config, self.auxiliary, share), videos.label, videos.objects
-            )
-            for share in self.context.each("shares of the objects", SHARES)
-        }
-
-    def policy_variants(self, seed: int) -> dict[str, np.ndarray]:
-        """Answers of policies with something left out or added."""
+    def policy_variants(self) -> dict[str, np.ndarray]:
+        """Log-probabilities of policies of one member with something left out or added; the last pools videos."""
         single = dataclasses.replace(self.config, members=1)
-        tune, untaught = self.config.tune, dataclasses.replace(self.config.reading, steps=0)
-        faster = dataclasses.replace(tune.optimizer, lr_scale=300.0)
-        from_scratch = dataclasses.replace(tune, steps=100, optimizer=faster)
+        several = dataclasses.replace(single.shape, contacts=6)
         changes: dict[str, dict[str, Any]] = {
             "one member": {},
-            "one member, not tuned on labels": {"tune": dataclasses.replace(tune, steps=0)},
-            "one member, on labels from scratch": {"reading": untaught, "tune": from_scratch},
-            "one member, components beside the evidence": {"components": 12},
-            "one member, then GRPO": {"reinforce": ReinforceConfig(steps=40)},
+            "one member, labels alone as targets": {"evidence": dataclasses.replace(single.evidence, rating_share=0.0)},
         }
-        return {
-            name: self.policy_answers(
-                dataclasses.replace(single, **change), seed, "ablation/" + name.replace(" ", "-").replace(",", "")
-            )
-            for name, change in changes.items()
-        }
+        stage = lambda name: "ablation/" + name.replace(" ", "-").replace(",", "")
+        found = {name: self.policy(dataclasses.replace(single, **new), stage(name)) for name, new in changes.items()}
+        pooled = pool(found["one member"], self.videos.objects)
+        name = "one member, all videos of the object in one prompt"
+        prompt = self.policy(dataclasses.replace(single, shape=several), stage(name), together=True)
+        return found | {"one member, probabilities of all videos pooled": pooled, name: prompt}
 
     def probe_variants(self) -> dict[str, np.ndarray]:
-        """Answers of the probes alone with something left out or added."""
+        """Log-probabilities of the probes alone with something left out or added."""
         config, auxiliary, evidence = self.config, self.auxiliary, self.config.evidence
-        with_probes = lambda **change: dataclasses.replace(config, evidence=dataclasses.replace(evidence, **change))
-        own, bare = (
-            tuple(dict.fromkeys(families())),
-            dataclasses.replace(auxiliary, unlabelled=auxiliary.unlabelled[:0]),
-        )
-        fewer = {name: getattr(auxiliary, name)[::10] for name in ("scene_x", "scene_target")}
+        change = lambda **new: dataclasses.replace(config, evidence=dataclasses.replace(evidence, **new))
+        own = tuple(dict.fromkeys(families()))
+        one_set = {name: getattr(auxiliary, name)[:1] for name in ("scene_x", "scene_target")}
+        few = {name: getattr(auxiliary, name)[:, ::10] for name in ("scene_x", "scene_target")}
+        bare = dataclasses.replace(auxiliary, unlabelled=auxiliary.unlabelled[:0])
         variants = {
-            "probe of what scenes teach": (config, auxiliary),
-            "the same, a tenth of the scenes": (config, dataclasses.replace(auxiliary, **fewer)),
+            "probes of what scenes teach": (config, auxiliary),
+            "the same, labels alone as targets": (change(rating_share=0.0), auxiliary),
+            "the same, one set of scenes": (config, dataclasses.replace(auxiliary, **one_set)),
+            "the same, a tenth of the scenes": (config, dataclasses.replace(auxiliary, **few)),
             "the same, no unlabelled videos": (config, bare),
-            "the same, scenes' ridge as the others'": (with_probes(scene_ridge=evidence.ridge), auxiliary),
-            "probes of the description, no scenes": (with_probes(families=own), auxiliary),
-            "probes of the description and of what scenes teach": (with_probes(families=(*own, SCENES)), auxiliary),
-            **{f"probe of {name} alone, no scenes": (with_probes(families=(name,)), auxiliary) for name in own},
+            **{
+                f"the same, {reading} alone": (
+                    change(families=tuple(f for f in SCENES if f"scenes, {reading}," in f)),
+                    auxiliary,
+                )
+                for reading in READINGS
+            },
+            **{
+                f"the same, {' and '.join(kinds)} alone": (
+                    change(families=tuple(f for f in SCENES if f.endswith(f", {group}"))),
+                    auxiliary,
+                )
+                for group, kinds in GROUPS.items()
+            },
+            "probes of the description, no scenes": (change(families=own), auxiliary),
         }
         every = self.context.each("variants of the probes", variants.items())
-        return {name: self.probe_answers(*variant) for name, variant in every}
+        return {name: self.probes(*variant) for name, variant in every}
 
     def label_limits(self) -> dict[str, np.ndarray]:
         """Answers that bound the answers of any policy.
 
-        - *vote*: the answers of the probes, those of an object's videos pooled.  The remaining errors are not due to
-          single trials.
         - *the object was touched before*: probes on all other videos, those of the same object among them.  Errors
           remain where trials of one object differ more than objects of different labels do.
         - *nearest other object*: the labels of the object whose mean description lies nearest.  Errors show how often
           objects of similar description were judged differently.
         """
         config, videos = self.config, self.videos
+        trial = np.zeros(len(videos.names), int)
+        for name in np.unique(videos.objects):
+            trial[videos.objects == name] = np.arange((videos.objects == name).sum())
         known = np.zeros_like(videos.label)
-        for i in self.context.each("touched before", range(len(videos.names))):
-            this = np.arange(len(videos.names)) == i
-            known[this] = probe_answers(config, videos.rows(~this), self.auxiliary, videos.rows(this))
-        answers = self.probe_answers(config, self.auxiliary)
+        for k in self.context.each("touched before", np.unique(trial)):
+            out = trial == k
+            p = probe_probabilities(config, videos.rows(~out), self.auxiliary, videos.rows(out))
+            known[out] = choose(joint_log_prob(p))
         return {
-            "probes": answers,
-            "probes, vote over all videos of an object": vote(answers, videos.objects),
+            "probes": choose(self.probes()),
             "probes, the object was touched before": known,
             "labels of the nearest other object": videos.label[_nearest_other(videos)],
         }
@@ -213,34 +202,33 @@ def _nearest_other(videos: DescribedVideos) -> Int[np.ndarray, "n"]:
     return first[distance.argmin(1)][member]
 
 
-def objects_for(errors: Mapping[int, float], bound: float) -> float:
-    """Number of objects to learn from until the error falls to a bound, by the power law through the measured points.
+def joint_log_prob(p: Float[np.ndarray, "n A K"], sharpness: float = SHARPNESS) -> Float[np.ndarray, "n 27"]:
+    """Log-probabilities of every answer if the attributes were independent, Σ_a ln (p_a^s / Σ p_a^s)."""
+    log = sharpness * np.log(np.maximum(p, 1e-6))
+    log -= np.log(np.exp(log).sum(-1, keepdims=True))
+    return sum(log[:, a][:, COMBINATIONS[:, a]] for a in range(p.shape[1]))
 
-        ln e(n) = a − b ln n by least squares;   n = exp((a − ln bound) / b)
 
-    The form of learning curves in Hestness et al. 2017, without a floor; if there is one, more objects are needed.
+def marginals(log_prob: Float[np.ndarray, "n 27"]) -> Float[np.ndarray, "n A K"]:
+    """Probability of each level of each attribute."""
+    return np.einsum("nc,cak->nak", np.exp(log_prob), np.eye(LEVELS)[COMBINATIONS])
 
-    Args:
-      errors: objects learned from → error, at two numbers of objects or more.
-      bound: error to reach, > 0.
 
-    Returns:
-      Objects: the fewest at which the bound was measured, else extrapolated; infinite where the error does not fall.
+def pool(log_prob: Float[np.ndarray, "n 27"], objects: np.ndarray) -> Float[np.ndarray, "n 27"]:
+    """For every video the answer to all videos of its object: the median of the probability of each level.
+
+    The median, for a press that missed the object says something else with confidence.
     """
-    reached = [n for n, error in errors.items() if error <= bound]
-    if reached:
-        return min(reached)
-    slope, start = np.polyfit(np.log(list(errors)), np.log(list(errors.values())), 1)
-    return math.exp((math.log(bound) - start) / slope) if slope < 0 else math.inf
-
-
-def vote(answer: Int[np.ndarray, "n A"], objects: np.ndarray) -> Int[np.ndarray, "n A"]:
-    """For every video the most frequent answer to its object's videos, per attribute, the lowest of equals."""
-    voted = answer.copy()
+    p = marginals(log_prob)
     for name in np.unique(objects):
-        mine = objects == name
-        voted[mine] = [np.bincount(column, minlength=LEVELS).argmax() for column in answer[mine].T]
-    return voted
+        middle = np.median(p[objects == name], 0)
+        p[objects == name] = middle / middle.sum(-1, keepdims=True)
+    return joint_log_prob(p, sharpness=1.0)
+
+
+def confidence(log_prob: Float[np.ndarray, "n 27"]) -> Float[np.ndarray, "n"]:
+    """Expected utility of the best answer, by which the surest answers are found."""
+    return (np.exp(log_prob) @ utility().T).max(-1)
 
 
 def agreement(answer: Int[np.ndarray, "n A"], objects: np.ndarray) -> float:
@@ -269,13 +257,3 @@ def score_table(
         rows.append(row)
     meanings = dict(SCORES) | {f"{name}, 95 %": f"interval of {name} over objects" for name in with_interval}
     return named_table(title, rows, formats=FORMATS, units=UNITS, meanings=meanings, note=note)
-
-
-def fold_table(answer: np.ndarray, label: np.ndarray, objects: np.ndarray, fold: np.ndarray) -> Table:
-    """Scores of every fold."""
-    rows = []
-    for k in np.unique(fold):
-        here = fold == k
-        row = {"fold": str(k + 1), "objects": len(np.unique(objects[here])), "videos": int(here.sum())}
-        rows.append(row | {name: score.mean() for name, score in scores(answer[here], label[here]).items()})
-    return named_table("Every fold", rows, formats=FORMATS | {"objects": "d", "videos": "d"}, units=UNITS)

@@ -14,29 +14,36 @@ from experiments.core.artifacts import write_bytes
 from experiments.core.context import Context
 from experiments.study.sources import SourceConfig, prepare_records
 from sensors_io.arrays import ArraysError, load_arrays
+from sensors_io.errors import MALFORMED
 from sensors_io.importers.keep import ImportSourceError, Skip
 from sensors_io.importers.physiclear import read_labels
 from sensors_io.importers.video import VideoError
 from sensors_io.records import RecordStore
+from sensors_io.scenes.cards import solid_of
 from sensors_io.scenes.config import SceneConfig, config_hash
 from sensors_io.schema import ATTRIBUTES
 from sensors_io.schema import LEVELS as SCENE_LEVELS
 from sensors_io.touches import describe, families, read_touch, touch_of_scene
-from touchr1_jax.models.description_policy import LANGUAGE
+from touchr1_jax.models.description_policy import LANGUAGE, LEVELS
 
 VERSION = 1  # raised when a description changes, so that no cache outlives it
 SUFFIXES = (".mov", ".mp4", ".avi", ".mkv")  # file names that count as videos in a folder that no table lists
 SENSOR = "gelsight_mini"
+ROWS = ("names", "objects", "label", "x", "rating")  # of `DescribedVideos`, one entry for each video
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DescribedVideos:
-    """n videos: name, object, levels (−1 unknown) and description of each, and those that could not be read."""
+    """n videos: name, object, levels (−1 unknown), people's ratings of it (NaN unknown) and description of each.
+
+    `skipped` are those that could not be read.
+    """
 
     names: np.ndarray
     objects: np.ndarray
     label: Int[np.ndarray, "n A"]
     x: Float[np.ndarray, "n D"]
+    rating: Float[np.ndarray, "n A"]
     skipped: tuple[Skip, ...] = ()
 
     def labelled(self) -> "DescribedVideos":
@@ -45,7 +52,7 @@ class DescribedVideos:
 
     def rows(self, chosen: np.ndarray) -> "DescribedVideos":
         """Some of the videos, by index or by mask."""
-        take = {name: getattr(self, name)[chosen] for name in ("names", "objects", "label", "x")}
+        take = {name: getattr(self, name)[chosen] for name in ROWS}
         return dataclasses.replace(self, **take)
 
 
@@ -54,12 +61,15 @@ class AuxiliaryData:
     """Data without labels of real objects: touches of generated objects and unlabelled videos.
 
     Args:
-      scene_x, scene_target: descriptions of the scenes, and their properties one-hot, level by level.
+      scene_x, scene_target: descriptions of S sets of scenes, and their properties: levels and material one-hot, then
+        the logarithms of the physical quantities behind them, standardised.
+      kinds: [T], whether a property is of the levels, the material or the physics.
       unlabelled: descriptions of the videos.
     """
 
-    scene_x: Float[np.ndarray, "n D"]
-    scene_target: Float[np.ndarray, "n T"]
+    scene_x: Float[np.ndarray, "S n D"]
+    scene_target: Float[np.ndarray, "S n T"]
+    kinds: np.ndarray
     unlabelled: Float[np.ndarray, "m D"]
 
 
@@ -73,7 +83,7 @@ def describe_source(source: Path, frames: int, context: Context, objects: int | 
       objects: how many labelled objects to take, the first of the table; `None` takes all, unlabelled ones too.
 
     Raises:
-      ImportSourceError: as `read_labels`, or not one readable video.
+      ImportSourceError: as `read_labels`, a ratings.json that is not as described, or not one readable video.
     """
     entries = read_labels(source / "labels.json")
     if objects is not None:
@@ -82,18 +92,49 @@ def describe_source(source: Path, frames: int, context: Context, objects: int | 
     files = [source / "videos" / name for entry in entries for name in entry.videos]
     owner = np.array([entry.card.object_id for entry in entries for _ in entry.videos])
     levels = [[e.card.labels[a.name] for a in LANGUAGE.attributes] for e in entries for _ in e.videos]
-    return _describe_files(files, owner, np.array(levels, np.int32).reshape(len(files), -1), frames, context)
+    found = _describe_files(files, owner, np.array(levels, np.int32).reshape(len(files), -1), frames, context)
+    rated = read_ratings(source / "ratings.json")
+    unknown = np.full(len(LANGUAGE.attributes), np.nan)
+    rating = np.array([rated.get(name, unknown) for name in found.objects]).reshape(len(found.names), -1)
+    return dataclasses.replace(found, rating=rating)
 
 
-def describe_folder(folder: Path, frames: int, context: Context) -> DescribedVideos:
-    """Describe the videos of a folder without labels.
+def read_ratings(path: Path) -> dict[str, Float[np.ndarray, "A"]]:
+    """Ratings of objects by people, 0 to 10, NaN for an attribute that was not rated; none where there is no file.
 
     Raises:
-      ImportSourceError: no such folder, no video in it, or not one that can be read.
+      ImportSourceError: a file that is not {"objects": {name: {attribute: number}}}.
     """
-    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES) if folder.is_dir() else []
-    if not files:
-        raise ImportSourceError(f"predict is {folder}: must hold videos ({', '.join(SUFFIXES)}); correct it")
+    if not path.is_file():
+        return {}
+    try:
+        table = json.loads(path.read_text())["objects"]
+        return {n: np.array([float(r.get(a.name, np.nan)) for a in LANGUAGE.attributes]) for n, r in table.items()}
+    except MALFORMED as error:
+        raise ImportSourceError(f"{path}: {error!r}; correct the entry or remove the file") from error
+
+
+def videos_of(places: Sequence[Path]) -> list[Path]:
+    """The videos that are named, a folder standing for those in it.
+
+    Raises:
+      ImportSourceError: no such video or folder, or a folder without a video.
+    """
+    files = []
+    for place in places:
+        inside = sorted(p for p in place.iterdir() if p.suffix.lower() in SUFFIXES) if place.is_dir() else [place]
+        if not inside or not inside[0].is_file():
+            raise ImportSourceError(f"predict is {place}: must be or hold videos ({', '.join(SUFFIXES)}); correct it")
+        files += inside
+    return files
+
+
+def describe_files(files: Sequence[Path], frames: int, context: Context) -> DescribedVideos:
+    """Describe videos without labels.
+
+    Raises:
+      ImportSourceError: not one that can be read.
+    """
     unknown = np.full((len(files), len(LANGUAGE.attributes)), -1, np.int32)
     return _describe_files(files, np.array([p.name for p in files]), unknown, frames, context)
 
@@ -121,12 +162,25 @@ def _describe_files(
     skipped = tuple(Skip(name=file.name, reason=str(why)) for file, why in zip(files, reasons, strict=True) if why)
     names = np.array([p.name for p in files])
     return DescribedVideos(
-        names=names[read], objects=objects[read], label=label[read], x=cached["x"][read], skipped=skipped
+        names=names[read],
+        objects=objects[read],
+        label=label[read],
+        x=cached["x"][read],
+        rating=np.full((len(read), label.shape[1]), np.nan),
+        skipped=skipped,
     )
 
 
-def auxiliary_data(config: SceneConfig, every: DescribedVideos, context: Context) -> AuxiliaryData:
-    """Generate and describe presses as a GelSight Mini sees them, and take the videos without all levels."""
+def auxiliary_data(config: SceneConfig, sets: int, every: DescribedVideos, context: Context) -> AuxiliaryData:
+    """Describe sets of scenes that differ in their seeds, and take the videos without all levels."""
+    made = [describe_scenes(dataclasses.replace(config, seed=config.seed + i), context) for i in range(sets)]
+    unlabelled = every.x[np.any(every.label < 0, 1)]
+    x, target, kinds = zip(*made, strict=True)
+    return AuxiliaryData(scene_x=np.array(x), scene_target=np.array(target), kinds=kinds[0], unlabelled=unlabelled)
+
+
+def describe_scenes(config: SceneConfig, context: Context) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Generate and describe presses as a GelSight Mini sees them: descriptions, properties and the kinds of these."""
 
     def make() -> dict[str, np.ndarray]:
         source = SourceConfig(scenes=config)
@@ -144,8 +198,14 @@ def auxiliary_data(config: SceneConfig, every: DescribedVideos, context: Context
         return {"x": np.array(x), "target": np.array(target)}
 
     scenes = _cached(context, "scene-descriptions", [VERSION, config_hash(config), families()], make)
-    unlabelled = every.x[np.any(every.label < 0, 1)]
-    return AuxiliaryData(scene_x=scenes["x"], scene_target=scenes["target"], unlabelled=unlabelled)
+    owner = np.repeat(np.arange(config.objects), config.sites)
+    truth = np.log([list(solid_of(config, i).truth().values()) for i in owner])
+    spread = truth.std(0)
+    physics = (truth - truth.mean(0)) / np.where(spread > 0, spread, 1.0)
+    levels = len(LANGUAGE.attributes) * LEVELS
+    named = scenes["target"]
+    kinds = ["levels"] * levels + ["material"] * (named.shape[1] - levels) + ["physics"] * physics.shape[1]
+    return scenes["x"], np.concatenate([named, physics], 1), np.array(kinds)
 
 
 def _cached(

@@ -1,9 +1,11 @@
 """An ensemble of policies trained on described videos, its answers, and its file."""
 
 import dataclasses
+import functools
 import hashlib
 import io
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import traverse_util
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from experiments.core.artifacts import jsonable, write_bytes
 from experiments.core.context import Context
 from experiments.core.loops import stage_hooks
-from experiments.recordings.descriptions import AuxiliaryData, DescribedVideos
+from experiments.recordings.descriptions import ROWS, AuxiliaryData, DescribedVideos
 from experiments.recordings.level_probes import LevelProbeConfig, ProbedVideos
 from sensors_io.arrays import load_arrays
 from sensors_io.importers.keep import ImportSourceError
@@ -31,11 +33,11 @@ from touchr1_jax.training.description_tuning import (
     reinforce,
     tune,
 )
-from touchr1_jax.training.kernel_probe import object_weights, standardise
+from touchr1_jax.training.kernel_probe import object_weights
 from touchr1_jax.types import Params
 
 READINGS = 8192  # examples of made-up evidence
-ROWS = 64  # numbers of videos are padded to a multiple of it
+BLOCK = 64  # numbers of videos are padded to a multiple of it
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -44,23 +46,22 @@ class LearnConfig:
 
     Args:
       evidence: probes whose log-probabilities the encoder reads, and whose most likely levels `perceive` repeats.
-      reading, tune, reinforce: training on made-up evidence, then on the answers of real objects, then GRPO.
-      components: principal components of the description that the encoder reads too.
+      reading, tune, reinforce: training on made-up evidence, then on the answers of real objects, then GRPO.  The last
+        two have no steps by default: labels reach the policy through the evidence, and to learn from them again costs.
       members: policies of different seeds whose log-probabilities are averaged.
     """
 
     evidence: LevelProbeConfig = LevelProbeConfig()
-    components: int = 0
     members: int = 3
     shape: PolicyShape = PolicyShape()
     reading: TuneConfig = READING
-    tune: TuneConfig = TuneConfig()
+    tune: TuneConfig = TuneConfig(steps=0)
     reinforce: ReinforceConfig = ReinforceConfig()
 
     @property
     def inputs(self) -> int:
         """Numbers that the encoder reads."""
-        return len(self.evidence.families) * COMBINATIONS.shape[1] * LEVELS + self.components
+        return COMBINATIONS.shape[1] * LEVELS
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -87,12 +88,12 @@ def learn(
     """
     policy, seeds = description_policy(config.shape), [1000 * seed + m for m in range(config.members)]
     with context.timed(stage):
-        read = ProbedVideos(training, auxiliary, training, config.evidence)
-        weight = object_weights(training.objects, np.ones(len(training.names), bool))
-        components, _ = principal_components(read, config.components)
-        lessons = [_lesson(read.crossed(own), components, training.label, weight) for own in seeds]
-        readers = [_reader(config, 1000 + m, context) for m in range(config.members)]
-    trained = _tuned(config, config.tune, readers, lessons, seeds, context, stage)
+        trained = [_reader(config, 1000 + m, context) for m in range(config.members)]
+        lessons = list[Lesson]()
+        if config.tune.steps or config.reinforce.steps:
+            read = ProbedVideos(training, auxiliary, training, config.evidence)
+            lessons = [_lesson(config, read, training, own) for own in seeds]
+    trained = _tuned(config, config.tune, trained, lessons, seeds, context, stage)
     for m, own in enumerate(seeds if config.reinforce.steps else ()):
         with stage_hooks(context, f"grpo/{stage}/{own}", config.reinforce.steps) as hooks:
             trained[m] = reinforce(policy, config.reinforce, trained[m], lessons[m], own, hooks)
@@ -100,11 +101,12 @@ def learn(
     return TrainedEnsemble(config=config, params=params, training=training, auxiliary=auxiliary)
 
 
+@functools.lru_cache(maxsize=8)
 def _reader(config: LearnConfig, seed: int, context: Context) -> Params:
     """A policy that can read evidence and has met no object."""
-    shape, families, components = config.shape, len(config.evidence.families), config.components
-    policy, lesson = description_policy(shape), reading_lesson(families, components, READINGS, seed)
-    params, stage = policy.fresh(jax.random.key(seed), config.inputs), f"reading/{families}-{components}/{seed}"
+    contacts = config.shape.contacts
+    policy, lesson = description_policy(config.shape), reading_lesson(contacts, READINGS, seed)
+    params, stage = policy.fresh(jax.random.key(seed), config.inputs), f"reading/{contacts}/{seed}"
     return _tuned(config, config.reading, [params], [lesson], [seed], context, stage)[0]
 
 
@@ -124,53 +126,64 @@ def _tuned(
         return tune(description_policy(config.shape), tuning, members, lessons, seeds, hooks)
 
 
-def answer_log_probs(trained: TrainedEnsemble, videos: DescribedVideos) -> Float[np.ndarray, "n 27"]:
-    """Log-probabilities of every conclusion about videos, known or not; their levels and objects are ignored."""
+def answer_log_probs(
+    trained: TrainedEnsemble, videos: DescribedVideos, asked: Sequence[np.ndarray] | None = None
+) -> Float[np.ndarray, "n 27"]:
+    """Log-probabilities of every conclusion about objects, known or not; levels of the videos are ignored.
+
+    Args:
+      trained, videos: the ensemble, and the videos that it reads.
+      asked: rows of the videos that each prompt holds; by default a prompt for each video.
+    """
     config = trained.config
-    read = ProbedVideos(trained.training, trained.auxiliary, videos, config.evidence)
-    x = np.concatenate([evidence_inputs(read.evidence()), principal_components(read, config.components)[1]], 1)
-    padded = jnp.asarray(_padded(x), jnp.float32)
-    members = jnp.broadcast_to(padded, (config.members, *padded.shape))
-    return jax.device_get(description_policy(config.shape).posterior(trained.params, members))[: len(x)]
+    p = ProbedVideos(trained.training, trained.auxiliary, videos, config.evidence).evidence()
+    rows = [np.array([i]) for i in range(len(p))] if asked is None else asked
+    x = jnp.asarray(_padded(evidence_inputs(_prompts(p, rows, config.shape.contacts))), jnp.float32)
+    return jax.device_get(description_policy(config.shape).posterior(trained.params, x))[: len(rows)]
 
 
-def probe_answers(
+def probe_probabilities(
     config: LearnConfig, training: DescribedVideos, auxiliary: AuxiliaryData, videos: DescribedVideos
-) -> Int[np.ndarray, "n A"]:
-    """Answers of the probes without a policy: the most likely level of each attribute, families averaged."""
-    return ProbedVideos(training, auxiliary, videos, config.evidence).evidence().mean(1).argmax(-1)
+) -> Float[np.ndarray, "n A K"]:
+    """Probabilities of the probes without a policy."""
+    return ProbedVideos(training, auxiliary, videos, config.evidence).evidence()
 
 
-def principal_components(read: ProbedVideos, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Principal components of standardised descriptions, of the training videos and of the others."""
-    both = np.concatenate([read.fitted, read.others])
-    fitted = np.arange(len(both)) < len(read.fitted)
-    z = standardise(both, fitted)
-    _, _, axes = np.linalg.svd(z[fitted] - z[fitted].mean(0), full_matrices=False)
-    scores = standardise(z @ axes[:count].T, fitted)
-    return scores[fitted], scores[~fitted]
+def _lesson(config: LearnConfig, read: ProbedVideos, training: DescribedVideos, seed: int) -> Lesson:
+    """Prompts about the training objects: each of its videos alone or, if prompts hold several, draws of them.
 
-
-def _lesson(evidence: np.ndarray, components: np.ndarray, label: np.ndarray, weight: np.ndarray) -> Lesson:
-    """Padded by videos of weight 0, so that folds of different sizes share one compiled program."""
-    x = np.concatenate([evidence_inputs(evidence), components], 1)
+    Padded by rows of weight 0, so that folds of different sizes share one compiled program.
+    """
+    evidence, contacts, rng = read.crossed(seed), config.shape.contacts, np.random.default_rng(seed)
+    mine = [np.flatnonzero(training.objects == name) for name in training.objects]
+    draw = lambda rows: rng.choice(rows, min(len(rows), int(rng.integers(1, contacts + 1))), replace=False)
+    rows = [np.array([i]) if contacts == 1 else draw(rows) for i, rows in enumerate(mine)]
+    p = _prompts(evidence, rows, contacts)
     pad: Any = lambda y, kind: jnp.asarray(_padded(y), kind)
     return Lesson(
-        x=pad(x, jnp.float32),
-        percept=pad(evidence.mean(1).argmax(-1), jnp.int32),
-        label=pad(label, jnp.int32),
-        weight=pad(weight, jnp.float32),
+        x=pad(evidence_inputs(p), jnp.float32),
+        percept=pad(np.nanmean(p, 1).argmax(-1), jnp.int32),
+        target=pad(read.target, jnp.float32),
+        weight=pad(object_weights(training.objects, np.ones(len(rows), bool)), jnp.float32),
     )
 
 
+def _prompts(p: Float[np.ndarray, "n A K"], rows: Sequence[np.ndarray], contacts: int) -> Float[np.ndarray, "m C A K"]:
+    """Evidence of the videos of each prompt, the first C of them; NaN where it has fewer."""
+    out = np.full((len(rows), contacts, *p.shape[1:]), np.nan)
+    for i, mine in enumerate(rows):
+        out[i, : len(mine)] = p[mine[:contacts]]
+    return out
+
+
 def _padded(x: np.ndarray) -> np.ndarray:
-    """x with rows of zeros behind it, up to a multiple of `ROWS`."""
-    return np.pad(x, [(0, -len(x) % ROWS), *[(0, 0)] * (x.ndim - 1)])
+    """x with rows of zeros behind it, up to a multiple of `BLOCK`."""
+    return np.pad(x, [(0, -len(x) % BLOCK), *[(0, 0)] * (x.ndim - 1)])
 
 
 def save(path: Path, trained: TrainedEnsemble) -> None:
     """Publish an ensemble as one file."""
-    videos = {name: getattr(trained.training, name) for name in ("names", "objects", "label", "x")}
+    videos = {name: getattr(trained.training, name) for name in ROWS}
     parts = {"params": trained.params, "training": videos, "auxiliary": dict(vars(trained.auxiliary))}
     buffer = io.BytesIO()
     np.savez(buffer, identity=identity(trained.config), **traverse_util.flatten_dict(parts, sep="/"))

@@ -4,8 +4,11 @@ With 60 labelled objects a probe must have few degrees of freedom (`kernel_probe
 one were half of two, is five points worse.
 
 The properties of generated scenes are known exactly and cost nothing.  Probes learn them from the same description, and
-their predictions for a real video are further inputs of the probes above.  Scenes and videos are standardised each by
-their own mean and deviation: lamps, gels and hands differ, so only the order of touches within each world is used.
+their predictions for a real video are the inputs of the probes above.  Lamps, gels and hands differ between the worlds,
+so that only the order of touches within each is used: numbers are standardised each by its own world's mean and
+deviation, or replaced by their ranks.  Either way three groups of properties make a probe of their own, and the answer
+is the mean of the six, over scenes drawn with several seeds: which scenes were drawn, and which reading is chosen,
+changes single answers by more than any of them is better than the others.
 """
 
 import dataclasses
@@ -18,25 +21,39 @@ from sensors_io.touches import families
 from touchr1_jax.training.kernel_probe import (
     KernelProbeConfig,
     cross_probe,
+    graded_targets,
     kernel_ridge,
     object_weights,
     probe,
+    ranks,
     standardise,
 )
 
-SCENES = "scenes"  # family of the numbers that scene probes predict
+READINGS = ("standardised", "ranked")
+"""Ways in which numbers of the two worlds are made comparable."""
+
+GROUPS = {"all": ("levels", "material", "physics"), "named": ("levels", "material"), "graded": ("levels", "physics")}
+"""Groups of the properties of scenes, each read by a probe of its own."""
+
+SCENES = tuple(f"scenes, {reading}, {group}" for reading in READINGS for group in GROUPS)
+"""Families of the numbers that scene probes predict."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LevelProbeConfig(KernelProbeConfig):
-    """The probes; the family `scenes` are the predictions of scene probes, and `scene_ridge` is the λ of these.
+    """The probes; families other than those of the description are the predictions of scene probes.
 
-    It is ten times that of the others: they are read on another world than they are fitted on, and with λ = 1 the
-    answers about real objects depend on which scenes were drawn.
+    Args:
+      scene_ridge: λ of the scene probes, ten times that of the others: they are read on another world than they are
+        fitted on, and with λ = 1 the answers about real objects depend on which scenes were drawn.
+      rating_share: of the ratings in the targets, see `graded_targets`.
+      rating_width: of their kernel, on the scale of 0 to 10.
     """
 
-    families: tuple[str, ...] = (SCENES,)
+    families: tuple[str, ...] = SCENES
     scene_ridge: float = 10.0
+    rating_share: float = 0.5
+    rating_width: float = 1.0
 
 
 class ProbedVideos:
@@ -45,36 +62,71 @@ class ProbedVideos:
     def __init__(
         self, training: DescribedVideos, auxiliary: AuxiliaryData, videos: DescribedVideos, config: LevelProbeConfig
     ) -> None:
-        world = np.concatenate([training.x, auxiliary.unlabelled])
-        widen = lambda x: np.concatenate([x, sense(auxiliary, world, x, config)], 1).astype(np.float64)
-        self.fitted, self.others = widen(training.x), widen(videos.x)
+        world = np.concatenate([training.x, auxiliary.unlabelled]).astype(np.float64)
+        sensed, names = sense(auxiliary, world, np.concatenate([training.x, videos.x]).astype(np.float64), config)
+        both = np.concatenate([np.concatenate([training.x, videos.x]), sensed], 1).astype(np.float64)
+        self._fitted, self._others = both[: len(training.x)], both[len(training.x) :]
         self._training, self._config = training, config
-        self._family = np.array([*families(), *[SCENES] * (self.fitted.shape[1] - training.x.shape[1])])
+        self._family = np.array([*families(), *names])
         self._weight = object_weights(training.objects, np.ones(len(training.names), bool))
+        self.target = graded_targets(
+            training.label,
+            training.rating,
+            self._weight,
+            training.objects,
+            share=config.rating_share,
+            width=config.rating_width,
+        )
 
-    def evidence(self) -> Float[np.ndarray, "n M A K"]:
+    def evidence(self) -> Float[np.ndarray, "n A K"]:
         """Predictions for the other videos by probes that were fitted on all training videos."""
-        n, label = len(self.fitted), self._training.label
-        label = np.concatenate([label, np.zeros((len(self.others), label.shape[1]), np.int32)])
-        weight = np.concatenate([self._weight, np.zeros(len(self.others))])
-        return probe(np.concatenate([self.fitted, self.others]), label, weight, self._family, self._config)[n:]
+        n = len(self._fitted)
+        target = np.concatenate([self.target, np.zeros((len(self._others), *self.target.shape[1:]))])
+        weight = np.concatenate([self._weight, np.zeros(len(self._others))])
+        rows = np.concatenate([self._fitted, self._others])
+        return probe(rows, target, weight, self._family, self._config)[n:].mean(1)
 
-    def crossed(self, seed: int) -> Float[np.ndarray, "n M A K"]:
+    def crossed(self, seed: int) -> Float[np.ndarray, "n A K"]:
         """Predictions for the training videos by probes that were fitted without the object in question."""
-        t = self._training
-        return cross_probe(self.fitted, t.label, self._weight, t.objects, self._family, self._config, seed)
+        objects = self._training.objects
+        found = cross_probe(self._fitted, self.target, self._weight, objects, self._family, self._config, seed)
+        return found.mean(1)
 
 
 def sense(
     auxiliary: AuxiliaryData, world: Float[np.ndarray, "m D"], x: Float[np.ndarray, "n D"], config: LevelProbeConfig
-) -> Float[np.ndarray, "n T"]:
-    """Predictions of scene probes for videos: each level of hardness, roughness and protrusion, and each material.
+) -> tuple[Float[np.ndarray, "n T"], list[str]]:
+    """Predictions of scene probes for videos, the mean over the sets of scenes, and the family of each number.
 
-    `x` is standardised by mean and deviation of the descriptions of real videos in `world`, which need no label.
+    Both worlds are compared by mean and deviation or by rank; those of real videos come from `world`, which needs no
+    label.
     """
-    count = len(auxiliary.scene_x)
-    known = np.arange(len(world) + len(x)) < len(world)
-    real = standardise(np.concatenate([world, x]).astype(np.float64), known)[len(world) :]
-    made = standardise(auxiliary.scene_x.astype(np.float64), np.ones(count, bool))
+    chosen, found, names = set(config.families), [], list[str]()
+    for reading in READINGS:
+        wanted = [group for group in GROUPS if f"scenes, {reading}, {group}" in chosen]
+        if not wanted:
+            continue
+        predicted = np.mean(
+            [_predict(s, auxiliary, world, x, reading, config) for s in range(len(auxiliary.scene_x))], 0
+        )
+        for group in wanted:
+            part = predicted[:, np.isin(auxiliary.kinds, GROUPS[group])]
+            found.append(part)
+            names += [f"scenes, {reading}, {group}"] * part.shape[1]
+    return np.concatenate(found, 1) if found else np.zeros((len(x), 0)), names
+
+
+def _predict(
+    number: int, auxiliary: AuxiliaryData, world: np.ndarray, x: np.ndarray, reading: str, config: LevelProbeConfig
+) -> Float[np.ndarray, "n T"]:
+    """All properties of videos, by a probe of one set of scenes."""
+    scenes = auxiliary.scene_x[number].astype(np.float64)
+    count, known = len(scenes), np.arange(len(world) + len(x)) < len(world)
+    if reading == "ranked":
+        made, real = ranks(scenes, scenes), ranks(x, world)
+    else:
+        made = standardise(scenes, np.ones(count, bool))
+        real = standardise(np.concatenate([world, x]), known)[len(world) :]
     both, fit = np.concatenate([made, real]), np.arange(count + len(x)) < count
-    return kernel_ridge(both, fit, np.full(count, 1 / count), auxiliary.scene_target, config.scene_ridge)[count:]
+    share = np.full(count, 1 / count)
+    return kernel_ridge(both, fit, share, auxiliary.scene_target[number], config.scene_ridge)[count:]

@@ -1,4 +1,4 @@
-"""The policy that answers for one touch: an encoder of its description in front of the decoder, and its answers.
+"""The policy that answers for one touch or several: an encoder of descriptions in front of the decoder, its answers.
 
 The prompt asks for hardness, roughness and protrusion at once, so that the answer is drawn from their joint
 distribution: the decoder writes roughness knowing the hardness that it wrote.  All 27 answers can be scored, so the
@@ -41,8 +41,9 @@ LENGTH = 18
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PolicyShape:
-    """Sizes: tactile tokens, width of the encoder, decoder."""
+    """Sizes: the most touches that a prompt holds, tactile tokens of each, width of the encoder, decoder."""
 
+    contacts: int = 1
     tokens: int = 4
     width: int = 96
     decoder: DecoderConfig = DecoderConfig(
@@ -71,27 +72,33 @@ class DescriptionPolicy(TouchPolicy):
     def fresh(self, key: Array, inputs: int) -> Params:
         """Fresh parameters for descriptions of so many numbers."""
         encoder_key, decoder_key = jax.random.split(key)
-        encoder = DescriptionEncoder(self.shape).init(encoder_key, jnp.zeros(inputs))["params"]
-        features = self.features({"encoder": encoder}, jnp.zeros(inputs))
+        touches = jnp.zeros((self.shape.contacts, inputs))
+        encoder = DescriptionEncoder(self.shape).init(encoder_key, touches)["params"]
+        features = self.features({"encoder": encoder}, touches)
         banned = jnp.asarray(self.fns.banned)
         prompt = jnp.asarray(self.layout.ids[0]), jnp.asarray(self.layout.mask[0]), self.fns.slots, banned
         decoder = self.fns.module.init(decoder_key, features, *prompt, method=Policy.prefill)["params"]["decoder"]
         return {"encoder": encoder, "decoder": decoder}
 
-    def features(self, params: Params, x: Float[Array, "*n D"]) -> Features:
-        """Decoder input from touches: one stream, all of whose tokens share one time; no view."""
-        lead, tokens, hidden = x.shape[:-1], self.shape.tokens, self.shape.decoder.hidden_size
-        touch = jnp.asarray(DescriptionEncoder(self.shape).apply({"params": params["encoder"]}, x))
+    def features(self, params: Params, x: Float[Array, "*n C D"]) -> Features:
+        """Decoder input from the touches of an object, of which those that are NaN do not exist.
+
+        They are one stream in which all tokens of a touch share one time; no view.
+        """
+        lead, hidden = x.shape[:-2], self.shape.decoder.hidden_size
+        exists = ~jnp.isnan(x[..., :1])
+        touch = DescriptionEncoder(self.shape).apply({"params": params["encoder"]}, jnp.where(exists, x, 0.0))
+        time = jnp.where(exists, jnp.arange(x.shape[-2])[:, None], -1)
         return Features(
-            touch=touch[..., None, :, :],
-            touch_time=jnp.zeros((*lead, 1, tokens), jnp.int32),
+            touch=jnp.asarray(touch).reshape(*lead, 1, -1, hidden),
+            touch_time=jnp.repeat(time, self.shape.tokens, -1).reshape(*lead, 1, -1),
             stream_mask=jnp.ones((*lead, 1), bool),
             view=jnp.zeros((*lead, 0, hidden)),
             view_mask=jnp.zeros(lead, bool),
         )
 
-    def log_probs(self, params: Params, x: Float[Array, "D"], tokens: Int[Array, "G T"]) -> Float[Array, "G T"]:
-        """Log-probability of every token of answers about one touch."""
+    def log_probs(self, params: Params, x: Float[Array, "C D"], tokens: Int[Array, "G T"]) -> Float[Array, "G T"]:
+        """Log-probability of every token of answers about one object."""
         ids, mask = jnp.asarray(self.layout.ids[0]), jnp.asarray(self.layout.mask[0])
         logits = self.fns.group_logits(params, self.features(params, x), ids, mask, tokens)
         return jnp.take_along_axis(jax.nn.log_softmax(logits), tokens[..., None], -1)[..., 0]
@@ -119,7 +126,7 @@ class DescriptionPolicy(TouchPolicy):
 
     @functools.cached_property
     def posterior(self) -> Any:
-        """Compiled (params of M members, x of M members [M, n, D]) → log-probabilities of the conclusions [n, 27].
+        """Compiled (params of M members, x [n, C, D]) → log-probabilities of the conclusions [n, 27].
 
         The members' log-probabilities are averaged; those of the conclusions follow the most likely percept.
         """
@@ -127,14 +134,14 @@ class DescriptionPolicy(TouchPolicy):
         same = jnp.arange(len(COMBINATIONS))
 
         def scored(params: Params, x: Array, tokens: Array, slots: np.ndarray) -> Array:
-            each = jax.vmap(self.log_probs, in_axes=(0, 0, None))(params, x, tokens)
+            each = jax.vmap(self.log_probs, in_axes=(0, None, None))(params, x, tokens)
             return jnp.mean(jnp.sum(each[..., slots], -1), 0)
 
-        def one(params: Params, x: Float[Array, "M D"]) -> Array:
+        def one(params: Params, x: Float[Array, "C D"]) -> Array:
             percept = jnp.argmax(scored(params, x, answers[same, same], perceive))
             return jax.nn.log_softmax(scored(params, x, answers[percept], conclude))
 
-        return jax.jit(lambda params, x: jax.lax.map(lambda row: one(params, row), x.swapaxes(0, 1), batch_size=16))
+        return jax.jit(lambda params, x: jax.lax.map(lambda row: one(params, row), x, batch_size=16))
 
 
 @functools.cache
@@ -142,7 +149,7 @@ def description_policy(shape: PolicyShape) -> DescriptionPolicy:
     """Tokenizer, prompt, decoder and parser of one question about one sensor; made once, as are its programs."""
     tokenizer = word_level(LANGUAGE, prompt_words())
     asked = [[attribute.name for attribute in LANGUAGE.attributes]]
-    layout = build_layout(tokenizer, LANGUAGE, tactile_tokens=shape.tokens, view_tokens=0, asked=asked)
+    layout = build_layout(tokenizer, LANGUAGE, tactile_tokens=shape.contacts * shape.tokens, view_tokens=0, asked=asked)
     config = PolicyConfig(
         tactile=TactileViTConfig(sensors=1),
         vision=VisionConfig(),

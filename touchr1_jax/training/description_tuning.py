@@ -66,47 +66,46 @@ class ReinforceConfig:
 
 @struct.dataclass
 class Lesson:
-    """Training data of a policy: n videos; those of weight 0 are never drawn.
+    """Training data of a policy: n prompts of up to C touches of one object; those of weight 0 are never drawn.
 
-    `percept` is the level by out-of-fold evidence about a video, `label` the annotators' level of its object.
+    `percept` is the level by out-of-fold evidence about the touches, `target` the probability of each level of the
+    object: what the policy is taught to conclude is drawn from it anew in every step.
     """
 
-    x: Float[Array, "n D"]
+    x: Float[Array, "n C D"]
     percept: Int[Array, "n A"]
-    label: Int[Array, "n A"]
+    target: Float[Array, "n A K"]
     weight: Float[Array, "n"]
 
 
-def reading_lesson(families: int, others: int, rows: int, seed: int) -> Lesson:
+def reading_lesson(contacts: int, rows: int, seed: int) -> Lesson:
     """Made-up evidence, and the answers that repeat it: the most likely levels perceived, the conclusion drawn from it.
 
-    With p ~ Dirichlet(1, 1, 1) of each family and attribute, p̄ their mean, and the input log p less its mean,
+    With p ~ Dirichlet(1, 1, 1) of each touch and attribute, p̄ their mean, and the input log p less its mean,
     percept = argmax p̄ and conclusion ~ p̄³ / Σ p̄³: ridge regression shrinks its probabilities, and a policy that
     repeats them would, by its own small errors, turn near ties.  This lesson costs no label.
 
     Args:
-      families: M, probes whose evidence is read.
-      others: number of further inputs, which are independent of the answer.
+      contacts: C, the most touches; prompts hold 1 to C of them.
       rows, seed: examples and seed of the draws.
     """
     rng, attributes = np.random.default_rng(seed), len(LANGUAGE.attributes)
-    p = rng.dirichlet(np.ones(LEVELS), (rows, families, attributes))
-    mean = p.mean(1)
+    p = rng.dirichlet(np.ones(LEVELS), (rows, contacts, attributes))
+    p[np.arange(contacts) >= rng.integers(1, contacts + 1, (rows, 1))] = np.nan
+    mean = np.nanmean(p, 1)
     sure = mean**3 / (mean**3).sum(-1, keepdims=True)
-    drawn = (rng.random((rows, attributes, 1)) > sure.cumsum(-1)).sum(-1)
-    x = np.concatenate([evidence_inputs(p), rng.standard_normal((rows, others))], 1)
     return Lesson(
-        x=jnp.asarray(x, jnp.float32),
+        x=jnp.asarray(evidence_inputs(p), jnp.float32),
         percept=jnp.asarray(mean.argmax(-1), jnp.int32),
-        label=jnp.asarray(np.minimum(drawn, LEVELS - 1), jnp.int32),
+        target=jnp.asarray(sure, jnp.float32),
         weight=jnp.ones(rows, jnp.float32),
     )
 
 
-def evidence_inputs(p: Float[np.ndarray, "n M A K"]) -> Float[np.ndarray, "n E"]:
+def evidence_inputs(p: Float[np.ndarray, "*n A K"]) -> Float[np.ndarray, "*n E"]:
     """Probabilities as inputs: their logarithms less the mean over the levels."""
     log = np.log(np.maximum(p, 1e-3))
-    return (log - log.mean(-1, keepdims=True)).reshape(len(p), -1)
+    return (log - log.mean(-1, keepdims=True)).reshape(*p.shape[:-2], -1)
 
 
 def tune(
@@ -143,10 +142,11 @@ def _tune_program(policy: DescriptionPolicy, config: TuneConfig) -> tuple[optax.
         return -masked.mean(each(x, tokens), counted)
 
     def advance(state: SFTState, key: Array, lesson: Lesson) -> tuple[SFTState, Array]:
-        draw, change = jax.random.split(key)
+        draw, change, conclude = jax.random.split(key, 3)
         share = lesson.weight / jnp.sum(lesson.weight)
         rows = jax.random.choice(draw, len(share), (config.batch_size,), p=share)
-        tokens = answers[number(lesson.percept), number(lesson.label)][rows]
+        concluded = jax.random.categorical(conclude, jnp.log(lesson.target[rows]))
+        tokens = answers[number(lesson.percept[rows]), number(concluded)]
         value, grads = jax.value_and_grad(loss)(state.params, disturb(change, lesson.x[rows], config), tokens)
         updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
         params = optax.apply_updates(state.params, updates)
@@ -155,11 +155,12 @@ def _tune_program(policy: DescriptionPolicy, config: TuneConfig) -> tuple[optax.
     return optimizer, jax.jit(advance)
 
 
-def disturb(key: Array, x: Float[Array, "n D"], config: TuneConfig) -> Float[Array, "n D"]:
-    """Inputs with some left out and noise on the rest."""
+def disturb(key: Array, x: Float[Array, "n C D"], config: TuneConfig) -> Float[Array, "n C D"]:
+    """Inputs with some left out and noise on the rest; touches that do not exist stay so."""
     drop_key, noise_key = jax.random.split(key)
     kept = jax.random.bernoulli(drop_key, 1 - config.drop, x.shape)
-    return jnp.where(kept, x + config.noise * jax.random.normal(noise_key, x.shape), 0.0) / (1 - config.drop)
+    moved = jnp.where(kept, x + config.noise * jax.random.normal(noise_key, x.shape), 0.0) / (1 - config.drop)
+    return jnp.where(jnp.isnan(x), x, moved)
 
 
 def number(levels: Int[Array, "*n A"]) -> Int[Array, "*n"]:
@@ -177,7 +178,7 @@ def reinforce(
 ) -> Params:
     """GRPO of one member's decoder; the encoder stays as it is."""
     rng = np.random.default_rng(seed)
-    noise = jnp.asarray(rng.standard_normal((64, lesson.x.shape[-1])), jnp.float32)
+    noise = jnp.asarray(rng.standard_normal((64, *lesson.x.shape[1:])), jnp.float32)
     weight = np.asarray(lesson.weight, np.float64)
     drawn = [rng.choice(len(weight), config.grpo.drawn, p=weight / weight.sum()) for _ in range(config.steps)]
     batches = grain.MapDataset.source(drawn).map(functools.partial(_questions, policy, params, lesson))
@@ -207,5 +208,5 @@ def _questions(policy: DescriptionPolicy, params: Params, lesson: Lesson, rows: 
         features=policy.features(params, lesson.x[rows]),
         ids=jnp.asarray(policy.layout.ids[first]),
         mask=jnp.asarray(policy.layout.mask[first]),
-        target=policy.target(first, np.asarray(lesson.label)[rows], np.ones((len(rows), 1), bool)),
+        target=policy.target(first, np.asarray(lesson.target)[rows].argmax(-1), np.ones((len(rows), 1), bool)),
     )

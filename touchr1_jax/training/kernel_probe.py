@@ -2,7 +2,7 @@
 
     K_ij = exp(−‖z_i − z_j‖ / median),   p = μ + k (K + λ W⁻¹)⁻¹ (Y − μ)
 
-z are standardised and clipped inputs, W the weight of each row, μ the weighted mean of the one-hot targets Y.
+z are standardised and clipped inputs, W the weight of each row, μ the weighted mean of the targets Y.
 """
 
 import collections
@@ -10,11 +10,14 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.special import ndtri
 
 LEVELS = 3
 """K of every ordinal attribute."""
 
+TAIL = 0.002  # least share of the reference beyond a rank
 LEAST = 0.02  # least probability of a level: a regression on one-hot targets may leave 0 to 1
+FEW = 0.1  # objects that the mean counts for where few others were rated alike
 CLIP = 4.0  # standard deviations to which inputs are clipped
 
 
@@ -41,14 +44,15 @@ def object_weights(objects: np.ndarray, chosen: Bool[np.ndarray, "n"]) -> Float[
 
 def probe(
     x: Float[np.ndarray, "n D"],
-    label: Int[np.ndarray, "n A"],
+    target: Float[np.ndarray, "n A K"],
     weight: Float[np.ndarray, "n"],
     family: np.ndarray,
     config: KernelProbeConfig,
 ) -> Float[np.ndarray, "n M A K"]:
     """Probabilities of every level of every attribute, by each family's probe, for all videos.
 
-    A video of weight 0 is left out of the fit, and its label ignored; `family` [D] names the family of each number.
+    A video of weight 0 is left out of the fit, and its target ignored; `target` holds the probability of each level,
+    one-hot where it is certain, and `family` [D] names the family of each number.
 
     Raises:
       ValueError: no video to fit on, or a family without numbers.
@@ -56,7 +60,7 @@ def probe(
     fit = weight > 0
     if not fit.any():
         raise ValueError("weight is 0 everywhere: a probe needs videos to fit; give the training videos a weight")
-    targets = np.eye(LEVELS)[label[fit]].reshape(fit.sum(), -1)
+    targets = target[fit].reshape(fit.sum(), -1)
     share = weight[fit] / weight[fit].sum()
     found = []
     for name in config.families:
@@ -71,7 +75,7 @@ def probe(
 
 def cross_probe(
     x: Float[np.ndarray, "n D"],
-    label: Int[np.ndarray, "n A"],
+    target: Float[np.ndarray, "n A K"],
     weight: Float[np.ndarray, "n"],
     objects: np.ndarray,
     family: np.ndarray,
@@ -79,13 +83,48 @@ def cross_probe(
     seed: int,
 ) -> Float[np.ndarray, "n M A K"]:
     """As `probe`, but a video of the fit is read by probes that saw no video of its object."""
-    found = probe(x, label, weight, family, config)
+    found = probe(x, target, weight, family, config)
     names = np.unique(objects[weight > 0])
     order = np.random.default_rng(seed).permutation(len(names))
     for k in range(min(config.folds, len(names))):
         out = np.isin(objects, names[order % config.folds == k]) & (weight > 0)
-        found[out] = probe(x, label, np.where(out, 0.0, weight), family, config)[out]
+        found[out] = probe(x, target, np.where(out, 0.0, weight), family, config)[out]
     return found
+
+
+def graded_targets(
+    label: Int[np.ndarray, "n A"],
+    rating: Float[np.ndarray, "n A"],
+    weight: Float[np.ndarray, "n"],
+    objects: np.ndarray,
+    *,
+    share: float,
+    width: float,
+) -> Float[np.ndarray, "n A K"]:
+    """Targets that are in part the label, in part the probability of each level given how people rated the object.
+
+        t = (1 − share) onehot(y) + share p,   p_k = (Σ_j w_j g_ij 1[y_j = k] + π μ_k) / (Σ_j w_j g_ij + π)
+
+    over videos j of other objects, with g_ij = exp(−(r_i − r_j)² / 2 width²), π = 0.1 and μ the weighted mean.  A label
+    that contradicts the rating weighs less.
+
+    Args:
+      label, rating: levels, and ratings on one scale for all objects; a rating of NaN is unknown, its target one-hot.
+      weight: w, all of objects that may be learned from.
+      objects: [n], the object of each video.
+      share: of the ratings in the target, 0 to 1.
+      width: of the kernel, in units of the rating.
+    """
+    hard = np.eye(LEVELS)[label]
+    target = hard.copy()
+    for a in range(label.shape[1]):
+        known = np.isfinite(rating[:, a])
+        gap = rating[:, None, a] - rating[None, :, a]
+        near = np.nan_to_num(np.exp(-0.5 * (gap / width) ** 2)) * weight * (objects[:, None] != objects)
+        mean = weight @ hard[:, a] / weight.sum()
+        given = (near @ hard[:, a] + FEW * mean) / (near.sum(1, keepdims=True) + FEW)
+        target[known, a] = ((1 - share) * hard[:, a] + share * given)[known]
+    return target
 
 
 def kernel_ridge(
@@ -102,6 +141,14 @@ def kernel_ridge(
     kernel = np.exp(-distance / (median if median > 0 else 1.0))  # rows that coincide have no scale of their own
     mean = share @ target
     return mean + kernel @ np.linalg.solve(kernel[fit] + ridge * np.diag(share.mean() / share), target - mean)
+
+
+def ranks(x: Float[np.ndarray, "n D"], among: Float[np.ndarray, "m D"]) -> Float[np.ndarray, "n D"]:
+    """Normal quantiles of each number's rank among reference rows: what any monotone change of a number leaves."""
+    sorted_ = np.sort(among, 0)
+    sides = [[np.searchsorted(sorted_[:, d], x[:, d], side) for d in range(x.shape[1])] for side in ("left", "right")]
+    middle = (np.sum(sides, 0).T + 1) / 2 / (len(among) + 1)
+    return ndtri(np.clip(middle, TAIL, 1 - TAIL))
 
 
 def standardise(x: np.ndarray, fit: np.ndarray) -> np.ndarray:

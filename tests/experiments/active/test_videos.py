@@ -27,7 +27,13 @@ def described(noise: float = 0.3, informative: bool = True) -> DescribedVideos:
     if informative:
         x += label[:, :1]
     names = np.array([f"{o}_{i}.mov" for i, o in enumerate(owner)])
-    return DescribedVideos(names=names, objects=np.array([f"o{o:02d}" for o in owner]), label=label, x=x)
+    return DescribedVideos(
+        names=names,
+        objects=np.array([f"o{o:02d}" for o in owner]),
+        label=label,
+        x=x,
+        rating=np.full((len(x), A), np.nan),
+    )
 
 
 def test_objects_with_too_few_videos_are_left_out():

@@ -1,11 +1,20 @@
 """Folds by object, weights, scores, and limits of the answers, by hand."""
 
-import math
-
 import numpy as np
 import pytest
 
-from experiments.recordings.cross_validation import agreement, constants, deal_folds, objects_for, scores, vote
+from experiments.recordings.baselines import constants, logistic, people
+from experiments.recordings.cross_validation import (
+    agreement,
+    confidence,
+    deal_folds,
+    joint_log_prob,
+    marginals,
+    pool,
+    scores,
+)
+from experiments.recordings.descriptions import DescribedVideos
+from experiments.recordings.findings import Answers, gains
 from touchr1_jax.models.description_policy import COMBINATIONS, choose, utility
 
 OBJECTS = np.repeat([f"o{i}" for i in range(12)], 3)
@@ -46,23 +55,48 @@ def test_the_choice_has_the_highest_expected_utility():
     assert COMBINATIONS.tolist().index(choose(np.log(p)[None])[0].tolist()) in (0, 26)
 
 
-@pytest.mark.parametrize(
-    ("errors", "bound", "objects"),
-    [
-        pytest.param({n: 80 * n**-0.5 for n in (4, 16, 64)}, 5.0, 256, id="the power law is continued"),
-        pytest.param({4: 30.0, 8: 0.0, 16: 0.0}, 25.0, 8, id="a measured point is not extrapolated"),
-        pytest.param({10: 30.0, 20: 31.0}, 25.0, math.inf, id="an error that does not fall"),
-    ],
-)
-def test_objects_that_a_bound_needs(errors, bound, objects):
-    assert objects_for(errors, bound) == pytest.approx(objects)
+def test_pooled_videos_answer_with_the_median_level():
+    p = np.full((3, 3, 3), 1 / 3)
+    p[0, 0], p[1, 0], p[2, 0] = (0.6, 0.3, 0.1), (0.8, 0.1, 0.1), (0.1, 0.1, 0.8)
+    log_prob = joint_log_prob(p, sharpness=1.0)
+    np.testing.assert_allclose(marginals(log_prob), p)
+    middle = np.array([0.6, 0.1, 0.1])
+    pooled = marginals(pool(log_prob, np.array(["a", "a", "a"])))
+    np.testing.assert_allclose(pooled[:, 0], np.tile(middle / middle.sum(), (3, 1)))
+    np.testing.assert_allclose(marginals(pool(log_prob, np.array(["a", "b", "c"]))), p)
 
 
-def test_the_vote_of_an_object_is_the_most_frequent_answer():
-    answer = np.array([[0, 2], [1, 2], [1, 0], [2, 1], [0, 1]])
-    objects = np.array(["a", "a", "a", "b", "b"])
-    np.testing.assert_array_equal(vote(answer, objects), [[1, 2], [1, 2], [1, 2], [0, 1], [0, 1]])
-    assert agreement(vote(answer, objects), objects) == 100
+def test_the_surest_answers_are_those_of_the_highest_expected_utility():
+    p = np.full((4, 3, 3), 1 / 3)
+    p[1], p[3] = (0.98, 0.01, 0.01), (0.01, 0.01, 0.98)
+    log_prob = joint_log_prob(p)
+    assert confidence(log_prob)[[1, 3]].min() > confidence(log_prob)[[0, 2]].max()
+    label = np.array([[1, 1, 1], [0, 0, 0], [1, 1, 1], [2, 2, 0]])
+    answers = Answers(log_prob=np.stack([log_prob] * 2), label=label, objects=np.array(["a", "b", "a", "b"]))
+    assert answers.surest(0.5).tolist() == [False, True, False, True] * 2
+    same = gains(answers, answers)["mean"]
+    assert (same.mean, same.low, same.high) == (0, 0, 0)
+
+
+def videos_of(level: np.ndarray) -> DescribedVideos:
+    noise = np.random.default_rng(0).standard_normal((len(level), 3))
+    return DescribedVideos(
+        names=np.arange(len(level)).astype(str),
+        objects=OBJECTS,
+        label=level,
+        x=np.concatenate([level, level], 1) + 0.1 * np.tile(noise, 2),
+        rating=np.stack([4.0 * level[:, 0], 4.0 * level[:, 1], np.full(len(level), np.nan)], 1),
+    )
+
+
+def test_logistic_regression_and_people_find_what_determines_the_level(monkeypatch):
+    monkeypatch.setattr("experiments.recordings.baselines.PENALTY", 1.0)
+    videos = videos_of(LABEL)
+    found = logistic(videos, deal_folds(OBJECTS, LABEL, 4, 0))
+    assert (choose(found)[:, :2] == LABEL[:, :2]).mean() > 0.7
+    said = people(videos)
+    assert sorted(said) == [0, 1]
+    assert (said[0] == LABEL[:, 0]).mean() > 0.9
 
 
 @pytest.mark.parametrize(
