@@ -34,7 +34,7 @@ BINS = (0.0, 0.2, 0.35, 0.5, 0.65, 0.8, 1.001)  # of stated probabilities
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Answers:
+class JudgedAnswers:
     """Log-probabilities of the answers to the same n videos on P partitions, and the truth.
 
     Args:
@@ -75,7 +75,7 @@ class Answers:
         return intervals(self.levels[mask], self.truth[mask], self.owner[mask])
 
 
-def gains(ours: Answers, others: Answers) -> dict[str, Interval]:
+def gains(ours: JudgedAnswers, others: JudgedAnswers) -> dict[str, Interval]:
     """Differences of the scores, paired by video, intervals over objects."""
     first, second = scores(ours.levels, ours.truth), scores(others.levels, others.truth)
     return {
@@ -86,7 +86,7 @@ def gains(ours: Answers, others: Answers) -> dict[str, Interval]:
     }
 
 
-def partition_table(answers: Answers, pooled: Answers, seeds: Sequence[int]) -> Table:
+def partition_table(answers: JudgedAnswers, pooled: JudgedAnswers, seeds: Sequence[int]) -> Table:
     """Scores of every partition, one video and all videos of the object."""
     rows = []
     for seed, *both in zip(seeds, answers.log_prob, pooled.log_prob, strict=True):
@@ -101,7 +101,7 @@ def partition_table(answers: Answers, pooled: Answers, seeds: Sequence[int]) -> 
 
 
 def people_table(found: Mapping[int, np.ndarray], videos: DescribedVideos) -> Table:
-    """How often what people said of an object, cut into levels, is its label."""
+    """Share of the videos whose object people rated, cut into levels, as it is labelled."""
     rows = list[dict[str, Any]]()
     for a, level in found.items():
         right = clustered_bootstrap(100.0 * (level == videos.label[:, a]), videos.objects)
@@ -114,7 +114,7 @@ def people_table(found: Mapping[int, np.ndarray], videos: DescribedVideos) -> Ta
     return named_table("People", rows or [{"attribute": "none rated", "right": 0.0, "95 %": ""}], note=note)
 
 
-def object_table(videos: DescribedVideos, answers: Answers, pooled: Answers) -> Table:
+def object_table(videos: DescribedVideos, answers: JudgedAnswers, pooled: JudgedAnswers) -> Table:
     """Every object: its label, the answer to all its videos together, the share of levels right."""
     text = lambda levels: "".join(map(str, levels))
     first, together = choose(answers.log_prob[0]), choose(pooled.log_prob[0])
@@ -134,7 +134,7 @@ def object_table(videos: DescribedVideos, answers: Answers, pooled: Answers) -> 
     )
 
 
-def confusions(answers: Answers) -> Picture:
+def confusions(answers: JudgedAnswers) -> Picture:
     """Frequency of each answered level for each label, one panel per attribute."""
     words = [[level[0] for level in attribute.levels] for attribute in LANGUAGE.attributes]
     levels, truth = answers.levels, answers.truth
@@ -147,7 +147,7 @@ def confusions(answers: Answers) -> Picture:
     )
 
 
-def abstention(answers: Answers) -> Picture:
+def abstention(answers: JudgedAnswers) -> Picture:
     """Scores over the share of the videos that is answered, and how often a stated probability comes true."""
     shares = [share for share in SHARES if len(np.unique(answers.owner[answers.surest(share)])) > 1]  # for intervals
     at = [100 * share for share in shares]

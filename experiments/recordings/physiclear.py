@@ -49,7 +49,7 @@ from experiments.recordings.descriptions import (
 )
 from experiments.recordings.findings import (
     NAMES,
-    Answers,
+    JudgedAnswers,
     abstention,
     confusions,
     gains,
@@ -170,7 +170,7 @@ def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Resul
         config=config.learn, videos=videos, auxiliary=auxiliary, fold=fold(seed), seed=seed, context=context
     )
     blind, elsewhere = [split(seed) for seed in config.seeds], split(DEVELOPMENT)
-    gather = lambda rows: Answers(log_prob=np.array(rows), label=videos.label, objects=videos.objects)
+    gather = lambda rows: JudgedAnswers(log_prob=np.array(rows), label=videos.label, objects=videos.objects)
     policy = gather([one.policy(config.learn, "fold") for one in blind])
     pooled = gather([pool(rows, videos.objects) for rows in policy.log_prob])
     spent = training_time(context.timing(), config.seeds[0])
@@ -217,7 +217,7 @@ def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Resul
     )
 
 
-def settings(config: PhysiclearStudy, policy: Answers, videos: DescribedVideos) -> dict[str, object]:
+def settings(config: PhysiclearStudy, policy: JudgedAnswers, videos: DescribedVideos) -> dict[str, object]:
     """Settings that the report names."""
     model = description_policy(config.learn.shape)
     params = jax.eval_shape(lambda key: model.fresh(key, config.learn.inputs), jax.random.key(0))

@@ -14,7 +14,7 @@ from experiments.recordings.cross_validation import (
     scores,
 )
 from experiments.recordings.descriptions import DescribedVideos
-from experiments.recordings.findings import Answers, gains
+from experiments.recordings.findings import JudgedAnswers, gains
 from touchr1_jax.models.description_policy import COMBINATIONS, choose, utility
 
 OBJECTS = np.repeat([f"o{i}" for i in range(12)], 3)
@@ -72,7 +72,7 @@ def test_the_surest_answers_are_those_of_the_highest_expected_utility():
     log_prob = joint_log_prob(p)
     assert confidence(log_prob)[[1, 3]].min() > confidence(log_prob)[[0, 2]].max()
     label = np.array([[1, 1, 1], [0, 0, 0], [1, 1, 1], [2, 2, 0]])
-    answers = Answers(log_prob=np.stack([log_prob] * 2), label=label, objects=np.array(["a", "b", "a", "b"]))
+    answers = JudgedAnswers(log_prob=np.stack([log_prob] * 2), label=label, objects=np.array(["a", "b", "a", "b"]))
     assert answers.surest(0.5).tolist() == [False, True, False, True] * 2
     same = gains(answers, answers)["mean"]
     assert (same.mean, same.low, same.high) == (0, 0, 0)
