@@ -89,7 +89,7 @@ def sft_seconds(policy: TouchPolicy, config: StudySFT, batch: SFTBatch, devices:
         return SFTState(params=params, opt_state=optimizer.init(params), step=jnp.zeros((), jnp.int32))
 
     state = jax.eval_shape(start, batch.touch)
-    return count_flops(step, state, batch) / (devices * machine.flops * machine.flops_share)
+    return count_flops(step, state, batch, {}) / (devices * machine.flops * machine.flops_share)
 
 
 def grpo_seconds(policy: TouchPolicy, config: GRPOConfig, devices: int, machine: Machine) -> float:

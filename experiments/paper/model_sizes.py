@@ -129,7 +129,7 @@ def timed_programs(study: Study) -> TimedPrograms:
     states = [SFTState(params=donated, opt_state=optimizer.init(donated), step=jnp.zeros((), jnp.int32))]
 
     def train() -> Any:
-        state, metrics = step(states.pop(), batch)
+        state, metrics = step(states.pop(), batch, {})
         states.append(state)
         return metrics
 

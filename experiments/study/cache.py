@@ -30,6 +30,7 @@ NEVER = (
     "touchr1_jax/asking.py",
     "touchr1_jax/bench/",
     "touchr1_jax/distributed/",
+    "touchr1_jax/models/adapted_folder.py",
     "touchr1_jax/models/description_policy.py",
     "touchr1_jax/models/saved_policy.py",
     "touchr1_jax/text/plain_questions.py",

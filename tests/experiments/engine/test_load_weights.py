@@ -4,13 +4,17 @@ import json
 import os
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import traverse_util
 
 from experiments.core.artifacts import read_json
 from experiments.engine import load_weights
 from experiments.engine.load_checkpoints import READERS, SHAPES, measure, random_checkpoint
 from tests.experiments.shrunk import run_shrunk
+from touchr1_jax.models.qwen.weights import load_params
+from touchr1_jax.models.stacked import unstacked
 
 TINY = SHAPES["tiny"]
 
@@ -44,8 +48,9 @@ def test_readers_read_the_same_small_numbers(checkpoint):
     assert len(list(folder.glob("*.safetensors"))) > 3
     assert json.loads((folder / "model.safetensors.index.json").read_text())["metadata"]["total_size"] == size
     ours, theirs = ([np.asarray(x) for x in read(folder, TINY, silent)] for read in READERS.values())
+    layers = unstacked(traverse_util.flatten_dict(load_params(folder, TINY, jnp.bfloat16), sep="."))
     by_content = lambda arrays: sorted((x.shape, x.tobytes()) for x in arrays)
-    assert by_content(ours) == by_content(theirs)
+    assert by_content(map(np.asarray, layers.values())) == by_content(theirs)
     assert size == sum(x.nbytes for x in ours) == load_weights.weight_bytes("tiny")
     sizes = np.abs(np.concatenate([x.ravel() for x in ours]).astype(np.float32))
     assert 2**-7 <= sizes.min() <= sizes.max() < 2**-6
