@@ -8,7 +8,7 @@ from collections.abc import Sequence as Seq
 
 from sensors_io.codec import decode_card, encode_sequence
 from sensors_io.index import Index, Part
-from sensors_io.remote import Place
+from sensors_io.remote import Mirror, Place
 from sensors_io.schema import ObjectCard, SchemaError, Sequence
 from sensors_io.shards import Entries, ShardWriter
 
@@ -102,10 +102,15 @@ class Cards(Mapping[str, ObjectCard]):
 
 
 def rest_pictures(root: Place) -> dict[str, bytes]:
-    """Files with the gel at rest that lie beside records on this machine, by name."""
-    if not isinstance(root, pathlib.Path):
-        return {}
-    return {path.name: path.read_bytes() for path in sorted((root / RESTS).glob("*.png"))}
+    """Files with the gel at rest that lie beside records, by name.
+
+    Raises:
+      StoreError: a URL that cannot be read.
+    """
+    if isinstance(root, pathlib.Path):
+        return {path.name: path.read_bytes() for path in sorted((root / RESTS).glob("*.png"))}
+    beside = Mirror(f"{root}/{RESTS}")
+    return {name: beside.fetch(name).read_bytes() for name in sorted(beside.files())}
 
 
 def put_rest_pictures(root: pathlib.Path, files: Mapping[str, bytes]) -> None:

@@ -9,9 +9,9 @@ from rich.table import Table
 
 from sensors_io import overview, quality
 from sensors_io.commands.console import OUT, complain, progress_bar
-from sensors_io.fields.recorded import RecordedGels, RestGel
+from sensors_io.fields.recorded import RecordedGels, RestGel, recorded_fields
 from sensors_io.fields.sources import read_picture
-from sensors_io.fields.types import Calibration
+from sensors_io.fields.types import Calibration, CalibrationError
 from sensors_io.records import CorruptRecordsError, IncompleteRecordsError, RecordsError, RecordStore
 
 
@@ -56,12 +56,13 @@ class Check:
                     found = quality.judge(sequence)
                     judged.add(quality.judged(sequence, found), found)
                 for sequence in contact if self.pictures else ():
-                    reason = gels.problem(sequence)
-                    if reason:
-                        unseen.update([reason])
-                    else:
-                        fields, extractor = gels.fields(sequence)
-                        looked.add(dataclasses.replace(sequence, flags=fields.flags), extractor.judged)
+                    try:
+                        extractor = gels.extractor(sequence)
+                    except CalibrationError as error:
+                        unseen.update([str(error)])
+                        continue
+                    flags = recorded_fields(sequence, extractor).flags
+                    looked.add(dataclasses.replace(sequence, flags=flags), extractor.judged)
                 progress(i + 1, len(store))
         OUT.print(overview.summary_table(store))
         left_out = _left_out(store)

@@ -6,6 +6,7 @@ import pathlib
 import tyro
 
 from sensors_io.commands.console import OUT
+from sensors_io.contents import RESTS, rest_pictures
 from sensors_io.index import INDEX
 from sensors_io.records import RecordStore
 from sensors_io.remote import Mirror
@@ -13,7 +14,7 @@ from sensors_io.remote import Mirror
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Push:
-    """Upload records to a URL, from which every command reads them: shards first, then the index.
+    """Upload records to a URL, from which every command reads them: gels at rest and shards first, then the index.
 
     A push that was interrupted goes on with the same command; what a reader sees until its end is what was there.
     """
@@ -25,7 +26,8 @@ class Push:
 
     def run(self) -> int:
         mirror, store = Mirror(self.url), RecordStore(self.records)
-        sent = mirror.publish(self.records, [*store.files, INDEX])
+        rests = [f"{RESTS}/{name}" for name in rest_pictures(self.records)]
+        sent = mirror.publish(self.records, [*rests, *store.files, INDEX])
         there = RecordStore(self.url)
         OUT.print(f"{len(there)} contacts at {there.path}, {sent / 1e6:.1f} MB were sent", highlight=False)
         return 0

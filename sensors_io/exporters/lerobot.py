@@ -130,7 +130,7 @@ def _columns(contact: Contact) -> dict[str, np.ndarray]:
 
 def _check(columns: dict[str, np.ndarray], features: dict[str, dict[str, Any]], sequence: Sequence) -> None:
     """Refuse a contact that has not the shape of the first one, or whose sensors differ in their frames."""
-    name = f"{sequence.key.object_id}/{sequence.key.site}/{sequence.key.motion}/{sequence.key.trial}"
+    name = sequence.name
     other = "name sensors by --sensors, contacts by --contacts, or export to zarr or hdf5"
     if differ := sorted(columns.keys() ^ features.keys()):
         raise ExportError(f"{name} and the first contact differ in {', '.join(differ)}: LeRobot wants one set; {other}")
@@ -141,7 +141,8 @@ def _check(columns: dict[str, np.ndarray], features: dict[str, dict[str, Any]], 
                 f"{name}: {column} has shape {want['shape']}, {features[column]['shape']} in the first contact: "
                 f"LeRobot wants one; {other}"
             )
-    if len(lengths := {column: len(array) for column, array in columns.items()}) and len(set(lengths.values())) > 1:
+    lengths = {column: len(array) for column, array in columns.items()}
+    if len(set(lengths.values())) > 1:
         few, many = min(lengths, key=lengths.__getitem__), max(lengths, key=lengths.__getitem__)
         raise ExportError(
             f"{name}: {few} has {lengths[few]} frames, {many} {lengths[many]}: LeRobot has one row for all; {other}"

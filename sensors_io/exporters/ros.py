@@ -98,8 +98,8 @@ def export_rosbag(selected: Selected, out: pathlib.Path, progress: Progress) -> 
 def _moments(contact: Mapping[str, Sequence], later_ns: int, make: Make) -> Iterator[tuple[int, TopicMessage]]:
     names = ("frames", "depth_mm", "force_n", "moment_nmm", "flags")
     for sensor, sequence in contact.items():
+        whole = {name: getattr(sequence, name) for name in names}
         for n, stamp in enumerate((sequence.host_time_ns + later_ns).tolist()):
-            whole = {name: getattr(sequence, name) for name in names}
             arrays = {name: None if array is None else array[n] for name, array in whole.items()}
             yield from ((stamp, said) for said in touch_messages(sensor, stamp, arrays, make))
 

@@ -8,8 +8,8 @@ import pathlib
 from collections.abc import Callable, Iterator
 
 from sensors_io.contents import put_rest_pictures, rest_pictures
-from sensors_io.fields.extract import ExtractConfig
-from sensors_io.fields.recorded import RecordedGels, RestGel, with_fields
+from sensors_io.fields.extract import ExtractConfig, Extractor
+from sensors_io.fields.recorded import RecordedGels, RestGel, recorded_fields, with_fields
 from sensors_io.fields.types import Calibration, CalibrationError
 from sensors_io.index import RecordsMeta
 from sensors_io.parts import make_part, part_path, write_by_units
@@ -125,19 +125,20 @@ def extract_shard(job: FieldsJob, out: pathlib.Path, number: int, first: int, la
 def _extracted(sequence: Sequence, job: FieldsJob, gels: RecordedGels) -> Sequence:
     if sequence.sensor != job.sensor:
         return sequence
-    _require_readable(sequence, gels)
-    fields, _ = gels.fields(sequence)
+    fields = recorded_fields(sequence, _readable(sequence, gels))
     return with_fields(sequence, fields, "" if job.calibration is None else job.calibration.hash, job.rows)
 
 
-def _require_readable(sequence: Sequence, gels: RecordedGels) -> None:
+def _readable(sequence: Sequence, gels: RecordedGels) -> Extractor:
     have = [name for name in ("depth_mm", "deformation_mm", "shear_mm") if getattr(sequence, name) is not None]
     if have:
         raise CalibrationError(
             f"{sequence.name} has {', '.join(have)} already: must have pictures alone; extract other records"
         )
-    if problem := gels.problem(sequence):
-        raise CalibrationError(f"{sequence.name} cannot be read: {problem}")
+    try:
+        return gels.extractor(sequence)
+    except CalibrationError as error:
+        raise CalibrationError(f"{sequence.name} cannot be read: {error}") from error
 
 
 def _try_first(store: RecordStore, job: FieldsJob) -> None:
@@ -150,7 +151,6 @@ def _try_first(store: RecordStore, job: FieldsJob) -> None:
         )
     sequence = store.contact(first)[job.sensor]
     gels = RecordedGels(store.path, job.gel, job.calibration, job.config)
-    _require_readable(sequence, gels)
-    refused = gels.extractor(sequence).refused
+    refused = _readable(sequence, gels).refused
     if job.calibration is None and len(refused) > 1:
         raise CalibrationError(f"{sequence.name} carries no field: {'; '.join(refused)}")

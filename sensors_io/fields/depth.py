@@ -131,14 +131,16 @@ def zero_level(depth_mm: np.ndarray, slope: np.ndarray, mm_per_px: float, config
     if not still.any():
         still = coarse <= np.quantile(coarse, 0.05)
     terms = _powers(rows, columns, degree)
-    low = np.linalg.lstsq(terms[still.ravel()], coarse[still], rcond=None)[0]
+    low = None
     if degree:
         away_mm = _distance_mm(slope, mm_per_px, config)
         near = away_mm > config.near_mm
         sinking = np.exp(-away_mm / np.float32(config.sinks_mm))
         both = np.column_stack([terms, sinking.ravel()])
         fitted = np.linalg.lstsq(both[near.ravel()], coarse[near], rcond=None)[0]
-        low = fitted[:-1] if fitted[-1] > 0 else low  # gel that rises beside a contact is a fault of the slopes
+        low = fitted[:-1] if fitted[-1] > 0 else None  # gel that rises beside a contact is a fault of the slopes
+    if low is None:
+        low = np.linalg.lstsq(terms[still.ravel()], coarse[still], rcond=None)[0]
     return (_powers(*depth_mm.shape, degree) @ low.astype(np.float32)).reshape(depth_mm.shape)
 
 

@@ -56,24 +56,21 @@ class RecordedGels:
         self._root, self._gel, self._calibration, self._config = root, gel, calibration, config
         self._extractors: dict[tuple[str, float, tuple[int, ...]], Extractor] = {}
 
-    def problem(self, sequence: Sequence) -> str:
-        """The reason why a sequence cannot be read; empty if it can."""
-        if sequence.frames is None:
-            return "they hold no pictures"
-        try:
-            self.extractor(sequence)
-        except (SchemaError, CalibrationError, SourceError) as error:
-            return str(error)
-        return ""
-
     def extractor(self, sequence: Sequence) -> Extractor:
-        """The extractor of a sequence with pictures.
+        """The extractor of a sequence.
 
         Raises:
-          CalibrationError: no gel at rest, or none of this shape; no pitch; a calibration of another window.
-          SchemaError, SourceError: a gel at rest that cannot be one, or cannot be read.
+          CalibrationError: no pictures; no gel at rest, none of this shape, or one that cannot be read; no pitch; a
+            calibration of another window.
         """
-        assert sequence.frames is not None
+        try:
+            return self._made(sequence)
+        except (SchemaError, SourceError) as error:
+            raise CalibrationError(str(error)) from error
+
+    def _made(self, sequence: Sequence) -> Extractor:
+        if sequence.frames is None:
+            raise CalibrationError("they hold no pictures")
         shape = sequence.frames.shape[1:]
         calibration = self._calibration
         if calibration is not None and calibration.background.shape != shape:
@@ -88,14 +85,6 @@ class RecordedGels:
         if not own:
             self._extractors[name, pitch, shape] = made
         return made
-
-    def fields(self, sequence: Sequence) -> tuple[Fields, Extractor]:
-        """Fields of every frame of a sequence with pictures, and the extractor that read them."""
-        assert sequence.frames is not None
-        extractor = self.extractor(sequence)
-        late = time_gap(sequence.host_time_ns, QualityConfig()) | (sequence.flags & Flag.TIME_GAP).astype(bool)
-        frames = zip(sequence.frames, late.tolist(), strict=True)
-        return joined([extractor.read(f, gap=gap, apart=n == 0) for n, (f, gap) in enumerate(frames)]), extractor
 
     def _pitch(self, sequence: Sequence, calibration: Calibration | None) -> float:
         pitch = self._gel.mm_per_px if sequence.mm_per_px is None else sequence.mm_per_px
@@ -127,6 +116,14 @@ class RecordedGels:
                 "height: crop them alike"
             )
         return rest
+
+
+def recorded_fields(sequence: Sequence, extractor: Extractor) -> Fields:
+    """Fields of every frame of a sequence with pictures, by the extractor that `RecordedGels` has for it."""
+    assert sequence.frames is not None
+    late = time_gap(sequence.host_time_ns, QualityConfig()) | (sequence.flags & Flag.TIME_GAP).astype(bool)
+    frames = zip(sequence.frames, late.tolist(), strict=True)
+    return joined([extractor.read(f, gap=gap, apart=n == 0) for n, (f, gap) in enumerate(frames)])
 
 
 def with_fields(sequence: Sequence, fields: Fields, calibration: str, rows: int = 0) -> Sequence:

@@ -12,6 +12,7 @@ from fsspec.implementations.memory import MemoryFileSystem
 
 from sensors_io import remote
 from sensors_io.__main__ import main
+from sensors_io.contents import put_rest_pictures, rest_pictures
 from sensors_io.records import CorruptRecordsError, RecordsError, RecordStore, RecordWriter
 from sensors_io.remote import Mirror, StoreError, place
 from tests.sensors_io import fakes
@@ -29,6 +30,7 @@ def cache(tmp_path, monkeypatch):
     store.store.clear()
     yield tmp_path / "cache"
     store.store.clear()
+    store.pseudo_dirs[1:] = []  # folders, but for the root
 
 
 @pytest.fixture
@@ -50,6 +52,13 @@ def test_records_at_a_url_are_those_that_were_pushed(records, cache):
     assert same(RecordStore(records), there)
     assert str(there.path) == URL
     assert RecordStore(pathlib.Path(URL)).digest == there.digest == RecordStore(records).digest  # as an option's value
+
+
+def test_gels_at_rest_are_pushed_too(records):
+    """Sequences name them, and `check` and `extract` read them."""
+    put_rest_pictures(records, {"rest.png": b"a picture"})
+    assert main(["push", str(records), URL]) == 0
+    assert rest_pictures(Mirror(URL)) == {"rest.png": b"a picture"}
 
 
 def test_a_second_push_sends_what_is_new(records, monkeypatch):

@@ -35,6 +35,7 @@ from touchr1_jax.models.saved_policy import (
     default_card,
     digest_of,
     format_of,
+    published,
     read_policy,
     read_sealed,
     rebuilt,
@@ -62,29 +63,25 @@ def save_adapted(folder: Path, saved: SavedPolicy, weights: str) -> None:
     """
     policy = saved.policy
     assert isinstance(policy, ReleasedPolicy)
-    unfinished = folder.with_name(f".{folder.name}.{os.getpid()}")
-    shutil.rmtree(unfinished, ignore_errors=True)
-    unfinished.mkdir(parents=True)
-    adapters = of_checkpoint(saved.params.get(ADAPTERS, {}))
-    save_adapters(unfinished, adapters, policy.checkpoint.config, policy.fns.lora, weights)
-    write_file(unfinished / TOUCH_FILE, touch_tensors(saved.params))
-    (unfinished / CARD).write_text(default_card(saved, "float32"), encoding="utf-8")
-    fields: dict[str, Any] = {
-        "model_type": ADAPTED,
-        "version": VERSION,
-        "weights": {"folder": weights, "files": file_marks(policy.checkpoint.directory)},
-        "sensors": saved.sensors,
-        "model": dataclasses.asdict(policy.model),
-        "lora": dataclasses.asdict(policy.fns.lora),
-        "prompt": instruction(policy.language),
-        "questions": dict(saved.questions),
-        "input": dataclasses.asdict(saved.reads),
-        "notes": dict(saved.notes),
-        "files": {name: digest_of(unfinished / name) for name in (PEFT_CONFIG, PEFT_WEIGHTS, TOUCH_FILE)},
-    }
-    (unfinished / CONFIG_FILE).write_text(seal(fields), encoding="utf-8")
-    shutil.rmtree(folder, ignore_errors=True)
-    unfinished.rename(folder)
+    with published(folder) as unfinished:
+        adapters = of_checkpoint(saved.params.get(ADAPTERS, {}))
+        save_adapters(unfinished, adapters, policy.checkpoint.config, policy.fns.lora, weights)
+        write_file(unfinished / TOUCH_FILE, touch_tensors(saved.params))
+        (unfinished / CARD).write_text(default_card(saved, "float32"), encoding="utf-8")
+        fields: dict[str, Any] = {
+            "model_type": ADAPTED,
+            "version": VERSION,
+            "weights": {"folder": weights, "files": file_marks(policy.checkpoint.directory)},
+            "sensors": saved.sensors,
+            "model": dataclasses.asdict(policy.model),
+            "lora": dataclasses.asdict(policy.fns.lora),
+            "prompt": instruction(policy.language),
+            "questions": dict(saved.questions),
+            "input": dataclasses.asdict(saved.reads),
+            "notes": dict(saved.notes),
+            "files": {name: digest_of(unfinished / name) for name in (PEFT_CONFIG, PEFT_WEIGHTS, TOUCH_FILE)},
+        }
+        (unfinished / CONFIG_FILE).write_text(seal(fields), encoding="utf-8")
 
 
 def read_adapted(

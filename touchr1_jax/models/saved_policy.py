@@ -6,6 +6,7 @@ DIR/tokenizer.json      vocabulary, as the `tokenizers` library writes it
 DIR/README.md           model card
 """
 
+import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -14,7 +15,7 @@ import os
 import shutil
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -109,15 +110,22 @@ def save_policy(folder: Path, saved: SavedPolicy, *, precision: Precision = "flo
     """
     if folder.exists() and format_of(folder) != FORMAT and (not folder.is_dir() or any(folder.iterdir())):
         raise PolicyError(f"folder is {folder}: it exists and is no policy; choose a new one")
-    unfinished, old = (folder.with_name(f".{folder.name}.{os.getpid()}{end}") for end in ("", ".old"))
-    shutil.rmtree(unfinished, ignore_errors=True)
-    unfinished.mkdir(parents=True)
-    try:
+    with published(folder) as unfinished:
         write_file(unfinished / SINGLE, _stored(saved.params, precision))
         words = [piece.decode().strip() for piece in saved.policy.tokenizer.pieces if piece]
         word_library(words).save(str(unfinished / TOKENIZER_FILE))
         (unfinished / CARD).write_text(card or default_card(saved, precision), encoding="utf-8")
         (unfinished / CONFIG_FILE).write_text(seal(_config(saved, precision, unfinished)), encoding="utf-8")
+
+
+@contextlib.contextmanager
+def published(folder: Path) -> Iterator[Path]:
+    """A new folder that takes the place of `folder` if the block ends without an error, and else vanishes."""
+    unfinished, old = (folder.with_name(f".{folder.name}.{os.getpid()}{end}") for end in ("", ".old"))
+    shutil.rmtree(unfinished, ignore_errors=True)
+    unfinished.mkdir(parents=True)
+    try:
+        yield unfinished
         if folder.exists():
             folder.rename(old)
         unfinished.rename(folder)

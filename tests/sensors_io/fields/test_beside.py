@@ -14,7 +14,7 @@ from sensors_io.errors import UserError
 from sensors_io.fields import beside
 from sensors_io.fields.beside import FieldsJob, fields_beside
 from sensors_io.fields.extract import ExtractConfig, Extractor
-from sensors_io.fields.recorded import RecordedGels, RestGel
+from sensors_io.fields.recorded import RecordedGels, RestGel, recorded_fields
 from sensors_io.fields.types import CalibrationError
 from sensors_io.records import RecordStore, RecordWriter
 from sensors_io.schema import Flag
@@ -136,14 +136,16 @@ def test_a_calibration_serves_pictures_of_another_size(tmp_path):
     half = tuple(n // 2 for n in SHAPE)
     small = np.stack([cv2.resize(f, half[::-1], interpolation=cv2.INTER_AREA) for f in recorded().frames])
     gels = RecordedGels(tmp_path, RestGel(background=bare()), CALIBRATION)
-    found, _ = gels.fields(recorded(frames=small, mm_per_px=None))
+    halved = recorded(frames=small, mm_per_px=None)
+    found = recorded_fields(halved, gels.extractor(halved))
     whole = Extractor(bare(), 0.1, CALIBRATION).extract(recorded().frames).depth_mm[1]
     area = cv2.resize(whole, half[::-1], interpolation=cv2.INTER_AREA)
     assert found.mm_per_px == pytest.approx(0.2)
     assert np.abs(found.depth_mm[1] - area).max() < 0.02 * area.max()
-    assert "must be equal" in gels.problem(recorded(frames=small, mm_per_px=0.1))
-    assert "same window" in gels.problem(recorded(frames=small[:, :-10]))
+    refused(CalibrationError, "must be equal", gels.extractor, recorded(frames=small, mm_per_px=0.1))
+    refused(CalibrationError, "same window", gels.extractor, recorded(frames=small[:, :-10]))
     lost = {"recording": {"background": "gone.png"}}
-    assert "gone.png is absent" in gels.problem(recorded(camera=lost))
-    assert "--mm-per-px" in RecordedGels(tmp_path, RestGel(rest_frames=1)).problem(recorded(mm_per_px=None))
-    assert RecordedGels(tmp_path, RestGel(rest_frames=1, mm_per_px=0.2)).problem(recorded(mm_per_px=None)) == ""
+    refused(CalibrationError, "gone.png is absent", gels.extractor, recorded(camera=lost))
+    own = lambda pitch: RecordedGels(tmp_path, RestGel(rest_frames=1, mm_per_px=pitch))
+    refused(CalibrationError, "--mm-per-px", own(None).extractor, recorded(mm_per_px=None))
+    assert own(0.2).extractor(recorded(mm_per_px=None)).judged
