@@ -163,9 +163,14 @@ def _local(launcher: Launcher) -> _Engine:
             raise
 
     def close() -> None:
-        for process in itertools.chain(*(list((pool._processes or {}).values()) for pool in made)):
-            process.terminate()  # they are idle, or the driver was told to end
-        threads.shutdown(cancel_futures=True)
+        threads.shutdown(wait=False, cancel_futures=True)
+        while True:  # a worker may be starting while the driver is told to end
+            running = any(thread.is_alive() for thread in threads._threads)
+            for process in itertools.chain(*(list((pool._processes or {}).values()) for pool in list(made))):
+                process.terminate()
+            if not running:
+                return
+            time.sleep(POLL_S)
 
     return (BrokenProcessPool,), lambda groups: [threads.submit(call, group) for group in groups], close
 

@@ -24,7 +24,7 @@ from experiments.core.errors import ConfigurationError
 from experiments.core.results import Table, named_table
 from touchr1_jax.models.active_policy import ActivePolicy
 from touchr1_jax.rl.environment import TouchBank
-from touchr1_jax.rl.gymnasium_env import make_gymnasium_env
+from touchr1_jax.rl.gymnasium_env import Episodes
 from touchr1_jax.training.exploration import touch_batch_of
 
 AGENT = "ppo"
@@ -38,12 +38,14 @@ class AgentConfig:
 
     Args:
       steps: actions and answers of a training.
-      rollout: of them between updates.
+      episodes: that run at once.
+      rollout: steps of all of them between updates.
       batch_size: of an update.
       rates, entropies: that are tried.
     """
 
     steps: int = 200_000
+    episodes: int = 64
     rollout: int = 4096
     batch_size: int = 512
     rates: tuple[float, ...] = (3e-4, 1e-3)
@@ -83,10 +85,54 @@ def agent_played(
     return {"played": found, "settings": {"learning rate": rate, "entropy bonus": entropy, "earned": worth}}
 
 
-def _environment(bank: TouchBank, policy: ActivePolicy, objects: Int[np.ndarray, "n"], arm: Arm) -> Any:
-    """Episodes of every question about some objects, object by object."""
+def _episodes(
+    bank: TouchBank, policy: ActivePolicy, objects: Int[np.ndarray, "n"], arm: Arm, count: int | None = None
+) -> Episodes:
+    """Episodes of every question about some objects, object by object; by default all at once."""
     which, asked = _every_question(objects)
-    return make_gymnasium_env(bank, touch_batch_of(policy, bank, which, asked), budget=arm.budget, prices=arm.prices)
+    batch = touch_batch_of(policy, bank, which, asked)
+    return Episodes(bank, batch, budget=arm.budget, prices=arm.prices, count=count or len(which))
+
+
+def _vectorised(episodes: Episodes, seed: int) -> Any:
+    """Episodes as Stable-Baselines3 steps through them: one that ends begins anew with a prompt drawn at random."""
+    from stable_baselines3.common.vec_env import VecEnv
+
+    rng = np.random.default_rng(seed)
+    drawn = lambda: rng.integers(episodes.prompts, size=episodes.count)
+
+    class Vectorised(VecEnv):
+        def __init__(self) -> None:
+            action_space, observation_space = episodes.spaces()
+            self.render_mode = None
+            super().__init__(episodes.count, observation_space, action_space)
+
+        def reset(self) -> Any:
+            return episodes.begin(drawn())
+
+        def step_async(self, actions: np.ndarray) -> None:
+            self._actions = actions
+
+        def step_wait(self) -> Any:
+            _, rewards, ended, totals = episodes.step(self._actions)
+            return episodes.begin(drawn(), ended), rewards, ended, totals
+
+        def close(self) -> None:
+            pass
+
+        def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+            return [getattr(self, attr_name)] * self.num_envs
+
+        def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+            raise NotImplementedError
+
+        def env_method(self, method_name: str, *args: Any, indices: Any = None, **options: Any) -> list[Any]:
+            raise NotImplementedError
+
+        def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+            return [False] * self.num_envs
+
+    return Vectorised()
 
 
 def _every_question(objects: Int[np.ndarray, "n"]) -> tuple[np.ndarray, np.ndarray]:
@@ -107,9 +153,9 @@ def _trained(
 
     model = stable_baselines3.PPO(
         "MultiInputPolicy",
-        _environment(bank, policy, objects, arm),
+        _vectorised(_episodes(bank, policy, objects, arm, config.episodes), seed),
         learning_rate=rate,
-        n_steps=config.rollout,
+        n_steps=config.rollout // config.episodes,
         batch_size=config.batch_size,
         ent_coef=entropy,
         gamma=1.0,
@@ -122,22 +168,24 @@ def _trained(
 
 def _played(bank: TouchBank, policy: ActivePolicy, model: Any, objects: Int[np.ndarray, "n"], arm: Arm) -> Played:
     """The likeliest actions of an agent in every episode."""
-    env, levels = _environment(bank, policy, objects, arm), np.asarray(bank.label)
     which, asked = _every_question(objects)
+    episodes, touches = _episodes(bank, policy, objects, arm), len(bank.choices)
+    seen = episodes.begin(np.arange(len(which)))
+    level, going = np.full(len(which), -1), np.ones(len(which), bool)
+    for _ in range(arm.budget + 1):
+        actions = np.where(
+            going, model.predict(seen, deterministic=True)[0], touches
+        )  # to conclude anew changes nothing
+        seen, _, ended, totals = episodes.step(actions)
+        level = np.where(going & ended, actions - touches, level)
+        going &= ~ended
+    right = level == np.asarray(bank.label)[which, asked]
+    seconds, harm = (np.array([of[name] for of in totals]) for name in ("seconds", "harm"))
     choices = np.full((len(which), arm.budget), NO_CHOICE, np.int32)
-    right, seconds, harm = (np.zeros(len(which)) for _ in range(3))
-    for i, (of_object, question) in enumerate(zip(which, asked, strict=True)):
-        seen, _ = env.reset(options={"prompt": i})
-        ended, totals, action = False, {}, 0
-        while not ended:
-            action = int(model.predict(seen, deterministic=True)[0])
-            seen, _, ended, _, totals = env.step(action)
-        taken = totals["actions"]
-        choices[i, : len(taken)] = taken
-        right[i] = action - len(bank.choices) == levels[of_object, question]
-        seconds[i], harm[i] = totals["seconds"], totals["harm"]
+    for row, of in zip(choices, totals, strict=True):
+        row[: len(of["actions"])] = of["actions"]
     shaped = lambda x: x.reshape(len(objects), len(PROPERTIES), *x.shape[1:])
-    return Played(*(shaped(x) for x in (right, seconds, harm, choices)))
+    return Played(*(shaped(x) for x in (right.astype(float), seconds, harm, choices)))
 
 
 def agents_table(settings: dict[str, dict[str, float]], steps: int) -> Table:

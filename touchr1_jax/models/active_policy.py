@@ -17,7 +17,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.models.layers import MASKED
-from touchr1_jax.models.lm import Caches, DecoderConfig, PrefixCache
+from touchr1_jax.models.lm import CompletionCaches, DecoderConfig, PrefixCache
 from touchr1_jax.models.policy import Features, Policy, PolicyConfig, Slots
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.tactile_vit import TactileViTConfig
@@ -89,9 +89,9 @@ class ActiveFns(PolicyFns):
         exists: Bool[Array, "n"],
         t: Int[Array, ""],
         prefix: PrefixCache,
-        caches: Caches,
+        caches: CompletionCaches,
         seen: Bool[Array, "T"],
-    ) -> tuple[Float[Array, "n D"], Caches, Bool[Array, "T"]]:
+    ) -> tuple[Float[Array, "n D"], CompletionCaches, Bool[Array, "T"]]:
         """Append embedded tokens to a trajectory; see `Decoder.advance`."""
         return self._apply(params, Policy.advance, x, exists, t, prefix, caches, seen)
 

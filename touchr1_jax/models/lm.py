@@ -61,10 +61,16 @@ class DecoderConfig:
 
 
 class Caches(NamedTuple):
-    """Keys and values of all layers: those before the last stacked along a first axis, as their parameters are."""
+    """Keys and values of a prompt: those of the layers before the last stacked along a first axis, as their parameters
+    are."""
 
     layers: LayerCache | None  # none in a decoder of one layer
     last: LayerCache
+
+
+CompletionCaches = tuple[LayerCache, ...]
+"""Keys and values of the tokens after a prompt, [KV, T, d] of each layer; a deep decoder has one stack of those before the
+last, [layer, KV, T, d]."""
 
 
 class PrefixCache(NamedTuple):
@@ -264,12 +270,12 @@ class Decoder(nn.Module):
         return self.last_layer.over_places(x, rotation, segments, places)
 
     def decode(
-        self, token: Int[Array, ""], t: Int[Array, ""], prefix: PrefixCache, caches: Caches
-    ) -> tuple[Float[Array, "D"], Caches]:
+        self, token: Int[Array, ""], t: Int[Array, ""], prefix: PrefixCache, caches: CompletionCaches
+    ) -> tuple[Float[Array, "D"], CompletionCaches]:
         """Hidden state of completion token t, and the caches with its row written (the sampler's forward pass)."""
         x = self.embed(token[None])
         rotation = self._rotation(jnp.broadcast_to(prefix.next_position + t, (3, 1)))
-        seen = jnp.arange(caches.last.k.shape[-2]) <= t
+        seen = jnp.arange(caches[-1].k.shape[-2]) <= t
         x, caches = self._append(x, rotation, t, prefix, caches, seen)
         return x[0], caches
 
@@ -279,9 +285,9 @@ class Decoder(nn.Module):
         exists: Bool[Array, "n"],
         t: Int[Array, ""],
         prefix: PrefixCache,
-        caches: Caches,
+        caches: CompletionCaches,
         seen: Bool[Array, "T"],
-    ) -> tuple[Float[Array, "n D"], Caches, Bool[Array, "T"]]:
+    ) -> tuple[Float[Array, "n D"], CompletionCaches, Bool[Array, "T"]]:
         """Append n embedded tokens at row t of the caches; those that do not exist are never attended to.
 
         Args:
@@ -297,7 +303,7 @@ class Decoder(nn.Module):
         """
         n, rows = x.shape[0], seen.shape[0]
         rotation = self._rotation(_text_positions(prefix.next_position + jnp.sum(seen), exists))
-        seen = _write_rows(seen[None, None, :, None], exists[None, :, None], 0, t)[0, 0, :, 0]
+        seen = _write_rows(seen[None, :, None], exists[None, :, None], None, t)[0, :, 0]
         mask = seen & (jnp.arange(rows) <= t + jnp.arange(n)[:, None])
         return *self._append(x, rotation, t, prefix, caches, mask), seen
 
@@ -321,25 +327,29 @@ class Decoder(nn.Module):
         rotation: Rotation,
         t: Int[Array, ""],
         prefix: PrefixCache,
-        caches: Caches,
+        caches: CompletionCaches,
         seen: Bool[Array, "*n T"],
-    ) -> tuple[Float[Array, "n D"], Caches]:
+    ) -> tuple[Float[Array, "n D"], CompletionCaches]:
         """Tokens through all layers, their keys and values written from row t on."""
 
-        def each(layer: DecoderLayer, carry: Any, past: LayerCache, stack: LayerCache, i: Any) -> Any:
-            q, row = layer.project(carry, rotation)
-            stack = jax.tree.map(lambda rows, new: _write_rows(rows, new, i, t), stack, row)
-            own = _layer_of(stack, i)
+        apart = len(caches) == self.config.num_layers
+
+        def each(layer: DecoderLayer, x: Any, past: LayerCache, cache: LayerCache, i: Any = None) -> Any:
+            q, row = layer.project(x, rotation)
+            cache = jax.tree.map(lambda rows, new: _write_rows(rows, new, i, t), cache, row)
+            own = cache if i is None else _layer_of(cache, i)
             keys = [KeySource(past.k, past.v, prefix.mask), KeySource(own.k, own.v, seen)]
-            return layer.finish(carry, attend(q, keys)), stack
+            return layer.finish(x, attend(q, keys)), cache
 
         def scanned(layer: DecoderLayer, carry: Any, i: Int[Array, ""]) -> tuple[Any, None]:
-            y, stack = carry  # the caches are carried and not mapped over, so that they are written in place
-            return each(layer, y, _layer_of(prefix.caches.layers, i), stack, i), None
+            x, (cache, *others) = carry  # the caches are carried and not mapped over, so that they are written in place
+            x, cache = each(layer, x, _layer_of(prefix.caches.layers, i), cache, None if apart else i)
+            return (x, (*others, cache)), None  # the cache of the next layer comes to the front
 
-        (x, layers), _ = self._scan(scanned, (x, caches.layers), jnp.arange(self.config.num_layers - 1))
-        x, last = each(self.last_layer, x, prefix.caches.last, jax.tree.map(lambda rows: rows[None], caches.last), 0)
-        return x, Caches(layers, _layer_of(last, 0))
+        *before, last = caches
+        (x, before), _ = self._scan(scanned, (x, tuple(before)), jnp.arange(self.config.num_layers - 1))
+        x, last = each(self.last_layer, x, prefix.caches.last, last)
+        return x, (*before, last)
 
     def _rotation(self, positions: Int[Array, "3 T"]) -> Rotation:
         c = self.config
@@ -368,19 +378,22 @@ def _layer_of(stack: Any, i: int | Int[Array, ""]) -> LayerCache:
 
 
 @custom_vmap
-def _write_rows(stack: Array, rows: Array, i: Array, t: Array) -> Array:
-    """stack [*n, layer, KV, T, d] with rows [*n, KV, m, d] of layer i replaced from t on; stays a slice update in place
-    under `vmap`, where jax's own rule makes a scatter."""
-    start: Any = (*(0,) * (stack.ndim - 4), i, 0, t, 0)
-    return jax.lax.dynamic_update_slice(stack, jnp.expand_dims(rows, -4), start)
+def _write_rows(cache: Array, rows: Array, i: Array | None, t: Array) -> Array:
+    """A cache [*n, KV, T, d], or layer i of a stack [*n, layer, KV, T, d], with rows [*n, KV, m, d] from t on.
+
+    It stays a slice update in place under `vmap`, where jax's own rule makes a scatter.
+    """
+    at: Any = (0, t, 0) if i is None else (i, 0, t, 0)
+    rows = rows if i is None else jnp.expand_dims(rows, -4)
+    return jax.lax.dynamic_update_slice(cache, rows, (*(0,) * (cache.ndim - len(at)), *at))
 
 
 @_write_rows.def_vmap
 def _write_rows_batched(
-    size: int, batched: list[bool], stack: Array, rows: Array, i: Array, t: Array
+    size: int, batched: list[bool], cache: Array, rows: Array, i: Array | None, t: Array
 ) -> tuple[Array, bool]:
     if batched[2] or batched[3]:
         raise ValueError("all rows of a decoding batch are written at the same index t: do not batch t")
-    stack = stack if batched[0] else jnp.broadcast_to(stack, (size, *stack.shape))
+    cache = cache if batched[0] else jnp.broadcast_to(cache, (size, *cache.shape))
     rows = rows if batched[1] else jnp.broadcast_to(rows, (size, *rows.shape))
-    return _write_rows(stack, rows, i, t), True
+    return _write_rows(cache, rows, i, t), True

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.models.blocked_attention import Segments
 from touchr1_jax.models.layers import RMSNorm
-from touchr1_jax.models.lm import Caches, Decoder, DecoderConfig, PrefixCache
+from touchr1_jax.models.lm import CompletionCaches, Decoder, DecoderConfig, PrefixCache
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.types import Params, TouchBatch
 
@@ -217,11 +217,11 @@ class Policy(nn.Module):
         """Embedded words."""
         return self.decoder.embed(tokens)
 
-    def advance(self, x, exists, t, prefix: PrefixCache, caches: Caches, seen):
+    def advance(self, x, exists, t, prefix: PrefixCache, caches: CompletionCaches, seen):
         """Append embedded tokens to a trajectory; see `Decoder.advance`."""
         return self.decoder.advance(x, exists, t, prefix, caches, seen)
 
-    def decode(self, token, t, prefix: PrefixCache, caches: Caches, banned: Bool[Array, "V"]):
+    def decode(self, token, t, prefix: PrefixCache, caches: CompletionCaches, banned: Bool[Array, "V"]):
         """Logits of completion token t + 1 after token t, and the grown caches."""
         hidden, caches = self.decoder.decode(token, t, prefix, caches)
         return self.decoder.logits(hidden, banned), caches

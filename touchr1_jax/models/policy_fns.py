@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.models.blocked_attention import LayerCache
-from touchr1_jax.models.lm import Caches, PrefixCache
+from touchr1_jax.models.lm import CompletionCaches, PrefixCache
 from touchr1_jax.models.lora import LoraConfig, adapted
 from touchr1_jax.models.policy import Features, Policy, Row, Slots
-from touchr1_jax.models.stacked import ADAPTERS
+from touchr1_jax.models.stacked import ADAPTERS, UNROLLED
 from touchr1_jax.text.template import PromptLayout
 from touchr1_jax.text.tokenizer import Tokenizer
 from touchr1_jax.types import Params, TouchBatch
@@ -96,8 +96,8 @@ class PolicyFns:
         return self._apply(params, Policy.prefill, features, ids, mask, self.slots, banned, known, start)
 
     def decode(
-        self, params: Params, token: Array, t: Array, prefix: PrefixCache, caches: Caches
-    ) -> tuple[Float[Array, "V"], Caches]:
+        self, params: Params, token: Array, t: Array, prefix: PrefixCache, caches: CompletionCaches
+    ) -> tuple[Float[Array, "V"], CompletionCaches]:
         """One token step of one rollout."""
         return self._apply(params, Policy.decode, token, t, prefix, caches, jnp.asarray(self.banned))
 
@@ -141,11 +141,15 @@ class PolicyFns:
         """Scores of the token that each hidden state predicts, banned ids out of reach."""
         return self._apply(params, Policy.logits, states, jnp.asarray(self.banned))
 
-    def empty_cache(self, length: int) -> Caches:
-        """Caches of one completion of at most `length` tokens."""
+    def empty_cache(self, length: int) -> CompletionCaches:
+        """Caches of one completion of at most `length` tokens.
+
+        Layers of a small decoder have one each: to attend to one of a stack copies it, for every token.
+        """
         c = self.module.config.decoder
-        zeros = lambda *n: LayerCache(*(jnp.zeros((*n, c.num_kv_heads, length, c.head_dim), self.cache_dtype),) * 2)
-        return Caches(zeros(c.num_layers - 1) if c.num_layers > 1 else None, zeros())
+        before, shape = c.num_layers - 1, (c.num_kv_heads, length, c.head_dim)
+        empty = lambda *n: LayerCache(*(jnp.zeros((*n, *shape), self.cache_dtype),) * 2)
+        return (empty(),) * c.num_layers if before <= UNROLLED else (empty(before), empty())
 
     def _apply(self, params: Params, method: Callable[..., Any], *args: Any) -> Any:
         whole = {**self.base, **params}

@@ -20,6 +20,8 @@ from touchr1_jax.rl.touch_reward import Prices, Spent, TouchReward, priced_answe
 from touchr1_jax.rl.trajectory import ActiveBatch
 from touchr1_jax.types import Parsed
 
+Observation = dict[str, Float[np.ndarray, "E *n"]]
+
 Encode = Callable[[Float[np.ndarray, "B N W"], Bool[np.ndarray, "B N"], Int[np.ndarray, "B"]], np.ndarray]
 """(tokens, which exist, actions or −1) of an episode so far → a float32 array of one shape, such as beliefs."""
 
@@ -54,91 +56,128 @@ def make_gymnasium_env(
         import gymnasium
     except ImportError as error:
         raise ImportError("gymnasium is not installed; run: pip install 'touchr1-jax[gymnasium]'") from error
-    episodes = _Episodes(environment, batch, budget, prices, reward, encode)
-    widest = float(np.finfo(np.float32).max)  # Gymnasium's check warns of infinite bounds
-    bounds = {"question": (0, 1), "actions": (0, 1), "touch": (-widest, widest)}
-    spaces = {name: gymnasium.spaces.Box(*bounds[name], x.shape, np.float32) for name, x in episodes.begin(0).items()}
+    episodes = Episodes(environment, batch, budget=budget, prices=prices, reward=reward, encode=encode)
 
     class ExplorationEnv(gymnasium.Env):
         """Episodes of questions about objects."""
 
-        action_space = gymnasium.spaces.Discrete(episodes.actions)
-        observation_space = gymnasium.spaces.Dict(spaces)
+        action_space, observation_space = episodes.spaces()
 
         def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
             """A new question; `options={"prompt": i}` chooses it."""
             super().reset(seed=seed)
             drawn = int(self.np_random.integers(episodes.prompts))
-            return episodes.begin(int((options or {}).get("prompt", drawn))), {}
+            return _only(episodes.begin(np.array([(options or {}).get("prompt", drawn)]))), {}
 
         def step(self, action: Any) -> Any:
             """Take an action or conclude."""
-            return episodes.step(int(action))
+            seen, reward, ended, totals = episodes.step(np.array([action]))
+            return _only(seen), float(reward[0]), bool(ended[0]), False, totals[0]
 
     return ExplorationEnv()
 
 
-class _Episodes:
-    """One episode after the other, on the host."""
+class Episodes:
+    """E episodes at once, on the host; the reward of each comes with its last step.
+
+    Attributes:
+      prompts, actions: numbers of prompts, and of actions of the environment and levels.
+    """
 
     def __init__(
         self,
         environment: Environment,
         batch: ActiveBatch,
+        *,
         budget: int,
         prices: Prices,
-        reward: TouchReward,
-        encode: Encode | None,
+        reward: TouchReward = priced_answer,
+        encode: Encode | None = None,
+        count: int = 1,
     ) -> None:
+        """See `make_gymnasium_env`; `count` is E."""
         outcome = check_environment(environment, batch.case, budget=budget)
-        self._shape = (budget, *outcome.tokens.shape[-2:])
         self._cases, self._target = jax.device_get((batch.case, batch.target))
-        self._budget, self._encode, self._count = budget, encode, len(environment.actions)
-        self.prompts = len(self._target.label)
-        self.actions = self._count + int(np.max(self._target.levels))
-        self._reset = jax.jit(lambda case: environment.reset(case))
-        self._step = jax.jit(lambda state, action: environment.step(state, action))
-        self._score = jax.jit(lambda parsed, target, spent: reward(parsed, target, spent, prices))
+        self._encode, self._kinds = encode, len(environment.actions)
+        self.prompts, self.count = len(self._target.label), count
+        self.actions = self._kinds + int(np.max(self._target.levels))
+        self._prompt = np.zeros(count, np.int32)
+        self._taken = np.full((count, budget), -1, np.int32)
+        self._touch = np.zeros((count, budget, *outcome.tokens.shape[-2:]), np.float32)
+        self._exists = np.zeros(self._touch.shape[:3], bool)
+        self._seconds, self._harm = np.zeros(count, np.float32), np.zeros(count, np.float32)
+        self._step = jax.jit(jax.vmap(lambda state, action: environment.step(state, action)))
+        self._score = jax.jit(jax.vmap(lambda parsed, target, spent: reward(parsed, target, spent, prices)))
+        self._begin = jax.jit(jax.vmap(lambda new, case, old: _where(new, environment.reset(case), old)))
+        self._state = jax.jit(jax.vmap(environment.reset))(self._of_prompts(self._cases))
 
-    def begin(self, prompt: int) -> dict[str, np.ndarray]:
-        """First observation of an episode."""
-        take = lambda tree: jax.tree.map(lambda x: jnp.asarray(x[prompt]), tree)
-        self._now, self._state = take(self._target), self._reset(take(self._cases))
-        self._touch, self._exists = np.zeros(self._shape, np.float32), np.zeros(self._shape[:2], bool)
-        self._taken, self._seconds, self._harm = list[int](), 0.0, 0.0
+    def begin(self, prompts: Int[np.ndarray, "E"], new: Bool[np.ndarray, "E"] | None = None) -> Observation:
+        """Begin the episodes of some prompts, by default all, and observe."""
+        new = np.ones(self.count, bool) if new is None else new
+        self._prompt = np.where(new, prompts, self._prompt)
+        self._state = self._begin(new, self._of_prompts(self._cases), self._state)
+        for x, empty in ((self._taken, -1), (self._touch, 0), (self._exists, 0), (self._seconds, 0), (self._harm, 0)):
+            x[new] = empty
         return self._observation()
 
-    def step(self, action: int) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
-        """Observation, reward, end, False, and the totals of an episode."""
-        if action >= self._count or len(self._taken) == self._budget:
-            level = action - self._count if action >= self._count else -1
-            return self._observation(), self._earned(level), True, False, self._totals()
-        self._state, outcome = self._step(self._state, jnp.int32(action))
-        place = len(self._taken)
-        self._exists[place] = outcome.exists
-        self._touch[place] = np.where(self._exists[place][:, None], outcome.tokens, 0)
-        self._taken.append(action)
-        self._seconds, self._harm = self._seconds + float(outcome.seconds), self._harm + float(outcome.harm)
-        return self._observation(), 0.0, False, False, self._totals()
+    def step(
+        self, actions: Int[np.ndarray, "E"]
+    ) -> tuple[Observation, Float[np.ndarray, "E"], Bool[np.ndarray, "E"], list[dict[str, Any]]]:
+        """Take an action in every episode: observations, rewards, which end, and totals."""
+        used = (self._taken >= 0).sum(1)
+        going = np.flatnonzero((actions < self._kinds) & (used < self._taken.shape[1]))
+        self._state, outcome = jax.device_get(self._step(self._state, np.minimum(actions, self._kinds - 1)))
+        at = going, used[going]
+        self._taken[at], self._exists[at] = actions[going], outcome.exists[going]
+        self._touch[at] = np.where(outcome.exists[going, :, None], outcome.tokens[going], 0)
+        self._seconds[going] += outcome.seconds[going]
+        self._harm[going] += outcome.harm[going]
+        ended = np.ones(self.count, bool)
+        ended[going] = False
+        rewards = np.where(ended, self._earned(np.maximum(actions - self._kinds, -1)), 0)
+        rows = zip(self._seconds.tolist(), self._harm.tolist(), self._taken.tolist(), strict=True)
+        totals = [{"seconds": s, "harm": h, "actions": tuple(a for a in taken if a >= 0)} for s, h, taken in rows]
+        return self._observation(), rewards, ended, totals
 
-    def _totals(self) -> dict[str, Any]:
-        return {"seconds": self._seconds, "harm": self._harm, "actions": tuple(self._taken)}
+    def spaces(self) -> tuple[Any, Any]:
+        """Gymnasium's spaces of one episode's actions and observations."""
+        from gymnasium.spaces import Box, Dict, Discrete
 
-    def _earned(self, level: int) -> float:
-        answer = jnp.where(self._now.asked, level, -1).astype(jnp.int32)
-        some = jnp.array(level >= 0)
+        widest = float(np.finfo(np.float32).max)  # Gymnasium's check warns of infinite bounds
+        bounds = {"question": (0, 1), "actions": (0, 1), "touch": (-widest, widest)}
+        seen = {name: Box(*bounds[name], x.shape[1:], np.float32) for name, x in self._observation().items()}
+        return Discrete(self.actions), Dict(seen)
+
+    def _of_prompts(self, tree: Any) -> Any:
+        return jax.tree.map(lambda x: x[self._prompt], tree)
+
+    def _earned(self, level: Int[np.ndarray, "E"]) -> Float[np.ndarray, "E"]:
+        """Rewards of episodes that conclude with a level, −1 for none."""
+        target = self._of_prompts(self._target)
+        answer, some = np.where(target.asked, level[:, None], -1).astype(np.int32), level >= 0
         parsed = Parsed(
-            perceive=answer[None], compare=answer, conclude=answer, formatted=some, truncated=~some, length=jnp.int32(0)
-        )
-        spent = Spent(jnp.float32(self._seconds), jnp.float32(self._harm), jnp.int32(len(self._taken)))
-        return float(sum(self._score(parsed, self._now, spent).values()))
+            perceive=answer[:, None], compare=answer, conclude=answer, formatted=some, truncated=~some,
+            length=np.zeros(self.count, np.int32),
+        )  # fmt: skip
+        spent = Spent(self._seconds, self._harm, (self._taken >= 0).sum(1, dtype=np.int32))
+        terms = jax.device_get(self._score(parsed, target, spent))
+        return np.sum(list(terms.values()), axis=0, dtype=np.float32)
 
-    def _observation(self) -> dict[str, np.ndarray]:
-        taken = np.bincount(np.array(self._taken, int), minlength=self._count)
-        actions = np.array(self._taken + [-1] * (self._budget - len(self._taken)))
-        touch = self._touch if self._encode is None else self._encode(self._touch, self._exists, actions)
+    def _observation(self) -> Observation:
+        touch = self._touch
+        if self._encode is not None:
+            touch = np.stack([self._encode(*one) for one in zip(touch, self._exists, self._taken, strict=True)])
+        times = (self._taken[:, :, None] == np.arange(self._kinds)).sum(1)
         return {
-            "question": np.asarray(self._now.asked, np.float32),
-            "actions": (taken / self._budget).astype(np.float32),
+            "question": self._of_prompts(self._target.asked).astype(np.float32),
+            "actions": (times / self._taken.shape[1]).astype(np.float32),
             "touch": np.array(touch, np.float32),
         }
+
+
+def _only(observation: Observation) -> Observation:
+    return {name: x[0] for name, x in observation.items()}
+
+
+def _where(which: Any, new: Any, old: Any) -> Any:
+    return jax.tree.map(lambda x, y: jnp.where(which, x, y), new, old)

@@ -15,7 +15,7 @@ from flax import struct
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
-from touchr1_jax.models.lm import Caches, PrefixCache
+from touchr1_jax.models.lm import CompletionCaches, PrefixCache
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.stacked import layer_by_layer
@@ -56,7 +56,7 @@ class GreedyAnswers:
     parsed: Parsed
 
 
-DecodeFn = Callable[[Array, Array, PrefixCache, Caches], tuple[Array, Caches]]
+DecodeFn = Callable[[Array, Array, PrefixCache, CompletionCaches], tuple[Array, CompletionCaches]]
 """(token [], t [], prefix, caches) → (logits [V] of token t + 1, caches), for one rollout."""
 
 

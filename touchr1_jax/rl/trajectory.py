@@ -15,7 +15,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.models.active_policy import ActiveFns
-from touchr1_jax.models.lm import Caches, PrefixCache
+from touchr1_jax.models.lm import CompletionCaches, PrefixCache
 from touchr1_jax.rl.environment import Environment
 from touchr1_jax.rl.rollout import GRPOBatch, SampleConfig, any_alive, draw_token, drawn_log_probs, tempered
 from touchr1_jax.text.turns import ANY_TURN, LAST_TURN
@@ -52,7 +52,7 @@ class _Walk(NamedTuple):
     state: Any
     alive: Bool[Array, "P G"]
     hidden: Float[Array, "P G D"]
-    caches: Caches
+    caches: CompletionCaches
     seen: Bool[Array, "P G R"]
 
 

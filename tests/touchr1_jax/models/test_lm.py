@@ -30,8 +30,8 @@ def prefill(params, x):
 
 def filled(value):
     """Caches of all layers, every entry `value`."""
-    rows = lambda *n: LayerCache(*(jnp.full((*n, CONFIG.num_kv_heads, T, CONFIG.head_dim), value),) * 2)
-    return Caches(rows(CONFIG.num_layers - 1), rows())
+    rows = LayerCache(*(jnp.full((CONFIG.num_kv_heads, T, CONFIG.head_dim), value),) * 2)
+    return (rows,) * CONFIG.num_layers
 
 
 def test_prefix_is_causal_by_zero_gradients(params):
@@ -77,6 +77,27 @@ def test_decode_reads_no_row_of_the_cache_after_its_own(params):
     np.testing.assert_array_equal(*hidden)
 
 
+def test_a_cache_for_each_layer_reads_as_one_for_all():
+    """Three tokens through five layers whose caches are apart or together: the same hidden states."""
+    config = dataclasses.replace(tiny.CONFIG.decoder, num_layers=5)
+    decoder, before = Decoder(config), config.num_layers - 1
+    positions, mask, tokens = jnp.broadcast_to(jnp.arange(L), (3, L)), jnp.ones(L, bool), jnp.array([7, 9, 11])
+    x = jnp.asarray(np.random.default_rng(3).normal(size=(L, D)), jnp.float32)
+    all_of = lambda module: (module.embed(tokens), module.states(x, positions, mask))
+    params = decoder.init(jax.random.key(0), method=all_of)["params"]
+    prefix = decoder.apply({"params": params}, x, positions, mask, method=Decoder.prefill)[1]
+    empty = lambda *n: LayerCache(*(jnp.zeros((*n, config.num_kv_heads, T, config.head_dim)),) * 2)
+    step = jax.jit(lambda *args: decoder.apply({"params": params}, *args, method=Decoder.decode))
+    found = []
+    for caches in ((empty(),) * config.num_layers, (empty(before), empty())):
+        for t, token in enumerate(tokens):
+            hidden, caches = step(token, jnp.int32(t), prefix, caches)
+        found.append((hidden, jnp.concatenate([x.k.reshape(-1, T, config.head_dim) for x in caches])))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), *found)
+    whole = decoder.apply({"params": params}, tokens, prefix, method=Decoder.extend)[-1]
+    np.testing.assert_allclose(found[0][0], whole, atol=1e-5)
+
+
 def test_banned_ids_have_no_probability():
     banned = jnp.arange(CONFIG.vocab_size) % 3 == 0
     logits = Decoder(tiny.CONFIG.decoder).apply(
@@ -101,7 +122,7 @@ def test_decoding_a_batch_writes_the_row_that_each_alone_writes(params, cache_ax
     for i, token in enumerate(tokens):
         alone = step(token, t, fresh)
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[i], b, atol=1e-5), together, alone)
-    np.testing.assert_array_equal((together.last.k == 5).all((0, 1, 3)), np.arange(T) != 2)
+    np.testing.assert_array_equal((together[-1].k == 5).all((0, 1, 3)), np.arange(T) != 2)
     with pytest.raises(ValueError, match="do not batch t"):
         jax.vmap(step, (None, 0, None))(tokens[0], jnp.arange(2), fresh)
 

@@ -134,11 +134,13 @@ def test_banned_ids_are_never_sampled(batch):
     assert len(np.unique(tokens)) > 10
 
 
-def test_empty_cache_has_the_shape_of_the_decoder():
-    c = tiny.CONFIG.decoder
-    caches = tiny.FNS.empty_cache(7)
-    assert caches.last.k.shape == caches.last.v.shape == (c.num_kv_heads, 7, c.head_dim)
-    assert caches.layers.k.shape == caches.layers.v.shape == (c.num_layers - 1, *caches.last.k.shape)
+@pytest.mark.parametrize(("layers", "stacks"), [(1, [()]), (3, [(), (), ()]), (12, [(11,), ()])])
+def test_empty_cache_has_the_shape_of_the_decoder(layers, stacks):
+    c = dataclasses.replace(tiny.CONFIG.decoder, num_layers=layers)
+    policy = dataclasses.replace(tiny.CONFIG, decoder=c)
+    fns = dataclasses.replace(tiny.FNS, module=dataclasses.replace(tiny.FNS.module, config=policy))
+    shapes = [(x.k.shape, x.v.shape) for x in fns.empty_cache(7)]
+    assert shapes == [((*n, c.num_kv_heads, 7, c.head_dim),) * 2 for n in stacks]
 
 
 def test_blind_features_hold_no_touch():

@@ -192,7 +192,7 @@ def test_half_precision_decodes_as_the_learner_scores(batch):
         return step, caches, fns.logits(params, states)[0, 1]
 
     step, caches, scored = both(half)
-    assert caches.last.k.dtype == caches.last.v.dtype == jnp.bfloat16
+    assert caches[-1].k.dtype == caches[-1].v.dtype == jnp.bfloat16
     assert step.dtype == jnp.float32
     np.testing.assert_allclose(step[WRITABLE], scored[WRITABLE], atol=0.02 * float(jnp.abs(scored[WRITABLE]).max()))
 
