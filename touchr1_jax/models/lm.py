@@ -69,8 +69,8 @@ class Caches(NamedTuple):
 
 
 CompletionCaches = tuple[LayerCache, ...]
-"""Keys and values of the tokens after a prompt, [KV, T, d] of each layer; a deep decoder has one stack of those before the
-last, [layer, KV, T, d]."""
+"""Keys and values of the tokens after a prompt, [KV, T, d] of each layer; in a deep decoder those before the last are a
+stack, [layer, KV, T, d]."""
 
 
 class PrefixCache(NamedTuple):
