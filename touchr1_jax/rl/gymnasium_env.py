@@ -20,7 +20,8 @@ from touchr1_jax.rl.touch_reward import Prices, Spent, TouchReward, priced_answe
 from touchr1_jax.rl.trajectory import ActiveBatch
 from touchr1_jax.types import Parsed
 
-Observation = dict[str, Float[np.ndarray, "E *n"]]
+Observation = dict[str, np.ndarray]
+"""Float32 arrays [E, …] of E episodes by their names."""
 
 Encode = Callable[[Float[np.ndarray, "B N W"], Bool[np.ndarray, "B N"], Int[np.ndarray, "B"]], np.ndarray]
 """(tokens, which exist, actions or −1) of an episode so far → a float32 array of one shape, such as beliefs."""

@@ -9,7 +9,7 @@ import pytest
 
 from tests.touchr1_jax import explored
 from tests.touchr1_jax.explored import BANK, BUDGET
-from touchr1_jax.rl.gymnasium_env import make_gymnasium_env
+from touchr1_jax.rl.gymnasium_env import Episodes, make_gymnasium_env
 from touchr1_jax.rl.touch_reward import Prices
 
 PRICES = Prices(jnp.float32(0.05), jnp.float32(0.1))
@@ -72,3 +72,24 @@ def test_beliefs_may_take_the_place_of_tokens():
     env = make(encode=lambda touch, exists, actions: np.append(exists.sum(), actions))
     assert env.observation_space["touch"].shape == (1 + BUDGET,)
     assert env.reset()[0]["touch"].tolist() == [0, *[-1] * BUDGET]
+
+
+def test_episodes_at_once_are_those_alone():
+    """Three episodes that touch, touch twice and conclude, and conclude at once; then the last begins anew."""
+    bank, batch = jax.tree.map(jnp.asarray, BANK), explored.batch_of(*OBJECTS)
+    make_episodes = lambda count: Episodes(bank, batch, budget=BUDGET, prices=PRICES, count=count)
+    together, alone = make_episodes(3), [make_episodes(1) for _ in range(3)]
+    actions, again = np.array([[1, 0, 2], [2, 1, 3], [2, 2, 2]]), np.array([False, False, True])
+    together.begin(np.arange(3))
+    for i, episodes in enumerate(alone):
+        episodes.begin(np.array([i]))
+    for row in actions:
+        stepped = together.step(row)
+        for i, (episodes, action) in enumerate(zip(alone, row, strict=True)):
+            observation, reward, ended, totals = episodes.step(np.array([action]))
+            jax.tree.map(lambda a, b, i=i: np.testing.assert_array_equal(a[i], b[0]), stepped[0], observation)
+            assert (stepped[1][i], stepped[2][i], stepped[3][i]) == (reward[0], ended[0], totals[0])
+    before, seen = stepped[0], together.begin(np.zeros(3, int), again)
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[:2], b[:2]), seen, before)
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[2], b[0]), seen, alone[0].begin(np.array([0])))
+    np.testing.assert_array_equal(stepped[2], [True, True, True])
