@@ -154,15 +154,13 @@ class Episodes:
 
     def _earned(self, level: Int[np.ndarray, "E"]) -> Float[np.ndarray, "E"]:
         """Rewards of episodes that conclude with a level, −1 for none."""
-        target = self._of_prompts(self._target)
-        answer, some = np.where(target.asked, level[:, None], -1).astype(np.int32), level >= 0
-        parsed = Parsed(
-            perceive=answer[:, None], compare=answer, conclude=answer, formatted=some, truncated=~some,
-            length=np.zeros(self.count, np.int32),
-        )  # fmt: skip
-        spent = Spent(self._seconds, self._harm, (self._taken >= 0).sum(1, dtype=np.int32))
-        terms = jax.device_get(self._score(parsed, target, spent))
-        return np.sum(list(terms.values()), axis=0, dtype=np.float32)
+        target, some = self._of_prompts(self._target), level >= 0
+        answer = np.where(target.asked, level[:, None], -1).astype(np.int32)
+        slots: dict[str, Any] = {"perceive": answer[:, None], "compare": answer, "conclude": answer}
+        ended: dict[str, Any] = {"formatted": some, "truncated": ~some, "length": np.zeros(self.count, np.int32)}
+        spent: Any = (self._seconds, self._harm, (self._taken >= 0).sum(1, dtype=np.int32))
+        terms = jax.device_get(self._score(Parsed(**slots, **ended), target, Spent(*spent)))
+        return np.stack(list(terms.values())).sum(0)
 
     def _observation(self) -> Observation:
         touch = self._touch
