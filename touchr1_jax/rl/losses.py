@@ -66,15 +66,12 @@ def grpo_loss(
         S_t = min(ρ_t A, clip(ρ_t, 1 − low, 1 + high) A),   ρ_t = π(o_t) / π_old(o_t)     (`surrogate` has others)
         c_t = min(π_old(o_t) / π_sampler(o_t), cap)                       (`importance` has another)
 
-    With score centering A times `expected_score` is subtracted from c_t S_t.
-
     ⟨·⟩ is the mean over the tokens of a prompt's group: `algorithm.average` for S and KL, per rollout for G and H.
     Source: Touch-R1 (arXiv 2605.27154, eq. 5), where N = P, w = 1/N, c = 1, η = λ = 0 and nothing bounds G.
 
     Args:
       terms: log-probability, reference KL, grounding G and entropy H of every token, [P, G, T].
-      old: log-probabilities that ratios are taken to.
-      sampler: log-probabilities that the tokens were drawn with.
+      old, sampler: log-probabilities that ratios are taken to, and those that the tokens were drawn with.
       mask: which tokens exist.
       advantage: A of each rollout, or of each of its tokens.
       weight: w, the weight of each prompt's policy gradient; 0 leaves the prompt out.
@@ -86,17 +83,12 @@ def grpo_loss(
 
     Returns:
       The loss, and per prompt the averages that it is made of, the largest KL and grounding of a token, the share of
-      clipped tokens, the mean and the largest |log π(o_t) − log π_sampler(o_t)|, and the share of dropped rollouts.
+      clipped tokens, and `mismatch_parts` of learner and sampler.
     """
-    algorithm, drawn = config.algorithm, mask
+    algorithm, dropped = config.algorithm, too_far(config.algorithm, old - sampler, mask)
     longest = divisor(config, mask) if longest is None else longest
-    dropped = too_far(algorithm, old - sampler, mask)
-    mask = mask & ~dropped[..., None]
-    objective, clipped, expected = policy_objective(algorithm, terms, old, sampler, mask, advantage, levels)
-    if algorithm.score_centering:
-        check_centering(algorithm)
-        a = advantage if advantage.ndim == mask.ndim else advantage[..., None]
-        objective -= a * expected_score(algorithm, terms.head_log_prob, head)
+    drawn, mask = mask, mask & ~dropped[..., None]
+    objective, clipped, expected = policy_objective(algorithm, terms, old, sampler, mask, advantage, levels, head)
     policy, kl = (group_mean(algorithm.average, x, mask, longest) for x in (objective, terms.reference_kl))
     per_rollout = lambda x: group_mean(Average.ROLLOUT, x, mask, longest)
     grounding, entropy = per_rollout(terms.grounding), per_rollout(terms.entropy)
@@ -104,9 +96,7 @@ def grpo_loss(
     explored = algorithm.entropy_weight * at_most(entropy, algorithm.entropy_floor_nat)
     further = grounded - loss_beta(algorithm) * kl + explored + (0.0 if answer is None else algorithm.anchor * answer)
     gain = jnp.sum(weight * policy) + jnp.sum(further) / config.prompts
-    gap = jnp.abs(jax.lax.stop_gradient(terms.log_prob) - sampler)
-    peak_of = lambda x, mask: jnp.max(jnp.where(mask, jax.lax.stop_gradient(x), 0.0), (-2, -1))
-    peak = lambda x: peak_of(x, mask)
+    peak = lambda x: jnp.max(jnp.where(mask, jax.lax.stop_gradient(x), 0.0), (-2, -1))
     return -gain, expected | {
         "surrogate": policy,
         "kl": kl,
@@ -115,9 +105,7 @@ def grpo_loss(
         "grounding_peak": peak(terms.grounding),
         "entropy": entropy,
         "clip_share": per_rollout(clipped.astype(jnp.float32)),
-        "sampler_gap": group_mean(Average.ROLLOUT, gap, drawn, longest),
-        "sampler_gap_peak": peak_of(gap, drawn),
-        "dropped_share": jnp.mean(dropped, -1),
+        **mismatch_parts(jax.lax.stop_gradient(terms.log_prob) - sampler, drawn, dropped),
     }
 
 
@@ -129,10 +117,11 @@ def policy_objective(
     mask: Bool[Array, "P G T"],
     advantage: Float[Array, "P G *t"],
     levels: LevelRewards | None,
+    head: Float[Array, "P G T K"] | None = None,
 ) -> tuple[Float[Array, "P G T"], Bool[Array, "P G T"], dict[str, Float[Array, "P"]]]:
     """c_t S_t of every token, where the clip cut its gradient off, and each prompt's mean E where it is enumerated.
 
-    Arguments are those of `grpo_loss`.
+    With score centering A times `expected_score` is subtracted.  Arguments are those of `grpo_loss`.
     """
     exact = None if levels is None else exact_levels(algorithm, terms, levels)
     trace = mask if levels is None else before_level(mask, levels.at)
@@ -140,6 +129,10 @@ def policy_objective(
     objective, clipped = surrogate(algorithm, terms.log_prob, old, trace, a)
     if algorithm.importance_cap is not None:
         objective *= jnp.minimum(importance(algorithm, old - sampler, mask), algorithm.importance_cap)
+    if algorithm.score_centering:
+        check_centering(algorithm)
+        wide = advantage if advantage.ndim == mask.ndim else advantage[..., None]
+        objective -= wide * expected_score(algorithm, terms.head_log_prob, head)
     if levels is None or exact is None:
         return objective, clipped, {}
     expected = {"expected_reward": jnp.mean(exact.expected, -1)}
@@ -183,6 +176,17 @@ def too_far(algorithm: Algorithm, log_ratio: Float[Array, "*n T"], mask: Bool[Ar
     if algorithm.mismatch_limit is None:
         return jnp.zeros(mask.shape[:-1], bool)
     return masked.mean(jnp.abs(log_ratio), mask, -1) > algorithm.mismatch_limit
+
+
+def mismatch_parts(
+    gap: Float[Array, "P G T"], mask: Bool[Array, "P G T"], dropped: Bool[Array, "P G"]
+) -> dict[str, Float[Array, "P"]]:
+    """Mean and largest |gap| of the drawn tokens of each prompt, and its share of dropped rollouts."""
+    return {
+        "sampler_gap": jnp.mean(masked.mean(jnp.abs(gap), mask, -1), -1),
+        "sampler_gap_peak": jnp.max(jnp.where(mask, jnp.abs(gap), 0.0), (-2, -1)),
+        "dropped_share": jnp.mean(dropped, -1),
+    }
 
 
 def check_centering(algorithm: Algorithm) -> None:
