@@ -71,6 +71,9 @@ class Rollout:
     tokens: Int[Array, "*batch T"]
     log_prob: Float[Array, "*batch T"]
     mask: Bool[Array, "*batch T"]
+    head_ids: Int[Array, "*batch K T"] | None = None
+    """The sampler's K most likely tokens at each place; `None` where nothing needs them."""
+    head_log_prob: Float[Array, "*batch K T"] | None = None
 
 
 SAMPLE = "sample"

@@ -52,6 +52,7 @@ from touchr1_jax.distributed.processes import (
 from touchr1_jax.models.layers import SizeError
 from touchr1_jax.models.load import WeightsError
 from touchr1_jax.rewards import RewardError
+from touchr1_jax.rl.served import RolloutError
 from touchr1_jax.training.checkpoint import CheckpointError
 from touchr1_jax.training.compilation import compilations_kept, compiled_quickly
 from touchr1_jax.training.loop import NonFiniteGradientError
@@ -95,6 +96,7 @@ KNOWN_ERRORS = (
     DifferentProcessesError,
     MachineError,
     RewardError,
+    RolloutError,
     SizeError,
     WeightsError,
     OSError,

@@ -78,7 +78,7 @@ def diagnose(arm: ArmMeasurements) -> tuple[str, ...]:
 
 def _failures(arm: ArmMeasurements) -> Iterator[str]:
     history, both = arm.history or TrainingHistory(start={}, end={}, alarms={}), arm.before.keys() & arm.after.keys()
-    meanings = {rule.code: rule.meaning for rule in RULES if not rule.at_once}
+    meanings = {rule.code: rule.meaning for rule in sorted(RULES, key=lambda rule: not rule.at_once)}
     for code, share in history.alarms.items():
         if share >= MOST:
             yield f"{code}: {meanings[code]} (alarm in {100 * share:.0f} % of the seeds)"

@@ -20,6 +20,7 @@ from touchr1_jax.models.load import WeightsError
 from touchr1_jax.models.released_policy import ReleasedPolicy
 from touchr1_jax.training.evaluation import Evaluation
 from touchr1_jax.training.optimizer import falling_adamw
+from touchr1_jax.training.rollout_server import RolloutsConfig, RolloutServer
 
 STEP, WEIGHTS, CONTACTS = "a step of GRPO", "weights as they were read", "encoded contacts, on the host"
 
@@ -64,6 +65,11 @@ def grpo_shape(config: TrainingConfig, policy: ReleasedPolicy, mesh: tuple[int, 
         )
     except ValueError as error:
         raise SizeError(f"GRPO cannot be shared by the devices of the mesh: {error}") from error
+
+
+def rollout_server(config: RolloutsConfig, context: Context) -> RolloutServer | None:
+    """The server that draws rollouts, where one is configured; it finds adapters in the run."""
+    return None if config.url is None else RolloutServer(config, context.directory / "adapters")
 
 
 def memory_table(lines: Mapping[str, int]) -> Table:

@@ -20,6 +20,9 @@ mean nothing.  With its drawn embeddings, which are frozen, no decoder can give 
 0.8 %: greedy answers parse, and GRPO samples noise.  `--scale small` first teaches such a checkpoint to write answers,
 without touch or pictures, and then trains it: without released weights one can watch the training learn.
 
+`--rollouts.url http://HOST:8000` lets a vLLM server of the same weights draw the rollouts of GRPO (README of
+`touchr1_jax`); prompts' tokens are then numbered one by one, in all stages, as such a server does.
+
 Pictures stay on disk: batches are read ahead by `--read-threads`, and the time that steps wait for them is logged.
 Several devices: `--distributed --mesh.fsdp N` as in every study, with `--grpo.micro-prompts` a multiple of N; each
 process reads the whole weights first.
@@ -37,6 +40,7 @@ for 500 steps; of ordinal questions about unseen objects 60 % are then answered 
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -76,8 +80,10 @@ from touchr1_jax.models.released_policy import ReleasedModel, ReleasedPolicy, bu
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import touch_shapes, with_lora
 from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.rl.served import check_served
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.training.optimizer import OptimizerConfig
+from touchr1_jax.training.rollout_server import RolloutsConfig
 from touchr1_jax.training.train_encoder import EncoderTrainingConfig
 from touchr1_jax.training.train_sft import SFTConfig
 from touchr1_jax.types import Params
@@ -149,6 +155,7 @@ class TouchR1Config(TrainingConfig):
     grpo_steps: int = 1_000
     lora: LoraConfig = LoraConfig()
     """Adapters of the released towers, the same from SFT to the end of GRPO."""
+    rollouts: RolloutsConfig = RolloutsConfig()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -159,6 +166,8 @@ class TouchR1Config(TrainingConfig):
                 f"grpo.bfloat16 is {self.grpo.bfloat16}: must be {not self.grpo.bfloat16} for weights in "
                 f"{self.model.dtype}; set both alike"
             )
+        if self.rollouts.url is not None:
+            check_served(self.grpo)
 
 
 def run(config: TouchR1Config, context: Context) -> Results:
@@ -174,7 +183,8 @@ def run(config: TouchR1Config, context: Context) -> Results:
     policy, data, tactile = begin(config, source, context)
     memory = released.memory_bytes(config, policy, data, context.devices.shape)
     context.print(", ".join(f"{name}: {size / 1e9:.3g} GB" for name, size in memory.items()))
-    study = train_study(config, data, policy, arms, context, variants=variants, tactile=tactile)
+    order: dict[str, Any] = {"tactile": tactile, "rollouts": released.rollout_server(config.rollouts, context)}
+    study = train_study(config, data, policy, arms, context, variants=variants, **order)
     scored = score_study(study)
     zero = [score(study, answers) for answers in study.variants[ZERO]]
     zero_shot = {metric: estimate([seed[metric] for seed in zero], scored.objects) for metric in zero[0]}
@@ -191,6 +201,7 @@ def run(config: TouchR1Config, context: Context) -> Results:
         settings={
             **study_settings(config),
             "weights": f"{source.name}, {config.model.dtype}",
+            "rollouts": config.rollouts.url or "by the step",
             "adapters": f"rank {config.lora.rank} on {', '.join((*config.lora.targets, *config.lora.vision_targets))}",
         },
         comparisons=tuple(compared({**scored.rows, ZERO: zero}, scored.objects, config.seeds)),
@@ -215,13 +226,16 @@ def begin(config: TouchR1Config, source: Path, context: Context) -> tuple[Releas
     Raises:
       WeightsError, SizeError: as `load_checkpoint` and the checks of `released_policy`.
     """
-    model = config.model
+    server = released.rollout_server(config.rollouts, context)
+    model = dataclasses.replace(config.model, in_order=config.model.in_order or server is not None)
     with context.progress_callback("reading weights, MB") as report:
         found = load_checkpoint(source, jnp.dtype(model.dtype), in_megabytes(report))
     released.require_same(source, context)
     ahead = build_released_policy(model, found, SENSORS)
     ahead.check(touch_shapes(model, model.view_px, SENSORS))
     released.grpo_shape(config, ahead, context.devices.shape)
+    if server is not None:
+        server.check(with_lora(ahead, config.lora), config.grpo, context.devices)
     if config.encoder is not None:
         load_encoder(config.encoder)  # what is no encoder is named before data are made
     data = open_data(config, model.view_px, context)

@@ -30,6 +30,7 @@ from touchr1_jax.models.policy import Features
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.training.evaluation import Evaluation, evaluate_policy
 from touchr1_jax.training.feeds import FULL_SHARE
+from touchr1_jax.training.rollout_server import RolloutServer
 from touchr1_jax.types import Params
 
 SFT, CONTINUED, BLIND = "sft", "sft_continued", "tactile_blind"
@@ -118,6 +119,8 @@ class SeedTraining(StudySeed):
     share: bool
     arms: Mapping[str, GRPOArm]
     variants: Mapping[str, EvalVariant]
+    rollouts: RolloutServer | None = None
+    """Server that draws the rollouts of GRPO; by default its steps do."""
 
     def answers(self) -> dict[str, Evaluation]:
         """Answers of all policies of this seed, from disk where they are there."""
@@ -164,6 +167,7 @@ class SeedTraining(StudySeed):
             stage = f"decoder/{CONTINUED}/{self.seed}"
             return more_sft(self.config.continued, params, seed=self.seed + CONTINUED_ORDER, stage=stage)
         order: dict[str, Any] = {"seed": self.seed, "stage": f"grpo/{name}/{self.seed}", "share": self.share}
+        order |= {"rollouts": self.rollouts}
         return run_grpo(self.policy, self.arms[name], contacts, params, self.context, **order)
 
     def _train_blind(self) -> Params:

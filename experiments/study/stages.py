@@ -33,6 +33,7 @@ from touchr1_jax.training.feeds import AnswerFeed, encoded_clips, host_touch, to
 from touchr1_jax.training.linear_probe import ProbeConfig, sensor_evidence, stream_features
 from touchr1_jax.training.loop import Batches, LoopConfig
 from touchr1_jax.training.questions import QuestionFeed
+from touchr1_jax.training.rollout_server import RolloutServer
 from touchr1_jax.training.train_encoder import EncoderTrainingConfig, touch_rows, train_encoder
 from touchr1_jax.training.train_grpo import train_grpo
 from touchr1_jax.training.train_sft import SFTConfig, train_sft
@@ -359,6 +360,7 @@ def run_grpo(
     seed: int,
     stage: str,
     share: bool = False,
+    rollouts: RolloutServer | None = None,
 ) -> Params:
     """GRPO of an SFT policy's decoder with an arm's reward; alarms are logged and printed; `share` as in `run_sft`."""
     config, loop = arm.config, arm.loop
@@ -371,7 +373,8 @@ def run_grpo(
         feed, noise = QuestionFeed(policy, contacts.features, contacts.label, **order), contacts.noise
         describe = functools.partial(describe_sample, policy)
         with stage_hooks(context, stage, loop.steps, make_log=alarm_log, describe=describe) as hooks:
-            return train_grpo(policy, params, feed, arm.score, config, loop, hooks, noise=noise, seed=seed)
+            order = {"noise": noise, "seed": seed, "rollouts": rollouts}
+            return train_grpo(policy, params, feed, arm.score, config, loop, hooks, **order)
 
     if not share:
         return train()

@@ -40,6 +40,7 @@ from touchr1_jax.rewards import AnyReward, RewardError, make_rewards, uniform_pr
 from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.training.evaluation import Evaluation
+from touchr1_jax.training.rollout_server import RolloutServer
 from touchr1_jax.training.train_encoder import EncoderTrainingConfig
 from touchr1_jax.training.train_grpo import check_rewards
 from touchr1_jax.types import Params
@@ -201,6 +202,7 @@ def train_study(
     *,
     tactile: Params | None = None,
     share: bool = False,
+    rollouts: RolloutServer | None = None,
 ) -> Study:
     """Train every arm of every seed and evaluate every policy, with data and policy at hand.
 
@@ -208,12 +210,13 @@ def train_study(
       config, data, policy, arms, context, algorithms, variants: as in `run_study`, which checks them.
       tactile: parameters of the tactile encoder that SFT starts from; `None` starts from fresh ones.
       share: take policies from the cache.
+      rollouts: server that draws the rollouts of GRPO; by default its steps do.
     """
     probed = probe_features(data, context)
     study = _shared(config, data, policy, arms, algorithms, probed, context)
     made: Mapping[str, GRPOArm] = study["arms"]
     answers: dict[str, list[Evaluation]] = {name: [] for name in (SFT, CONTINUED, *arms, BLIND, *variants)}
-    study |= {"share": share, "tactile": tactile, "variants": variants}
+    study |= {"share": share, "tactile": tactile, "variants": variants, "rollouts": rollouts}
     for seed in context.each("seeds", range(config.seeds)):
         for name, evaluation in SeedTraining(**study, seed=seed).answers().items():
             answers[name].append(evaluation)

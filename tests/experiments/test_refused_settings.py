@@ -13,6 +13,7 @@ from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.lora import LoraConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import ModelConfig
+from touchr1_jax.training.rollout_server import RolloutsConfig
 
 
 @pytest.mark.parametrize(
@@ -53,6 +54,14 @@ from touchr1_jax.models.touch_policy import ModelConfig
         ("paper.grpo_verdict.GrpoVerdictConfig", {"presets": ()}, "presets"),
         ("paper.pareto_sft.ParetoSFTConfig", {"end_to_end": (0,)}, "end_to_end is .0,.: must hold"),
         ("paper.pareto_sft.ParetoSFTConfig", {"decoder": ()}, "decoder is ..: must hold"),
+        (
+            "paper.touch_r1.DEFAULT",
+            {
+                "rollouts": RolloutsConfig(url="http://localhost:8000"),
+                "grpo": dataclasses.replace(touch_r1.DEFAULT.grpo, temperature=0.7),
+            },
+            r"temperature is 0\.7: must be 1\.0 where a server draws rollouts",
+        ),
         ("paper.touch_r1.DEFAULT", {"lora": LoraConfig(rank=0)}, r"lora\.rank is 0: must be at least 1, released"),
         (
             "paper.touch_r1.DEFAULT",

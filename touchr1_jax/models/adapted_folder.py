@@ -110,7 +110,7 @@ def read_adapted(
                 f"policy is {folder}: its released weights are not in {released}; say where by --weights DIR"
             )
         require_marks(folder, released, config["weights"]["files"])
-        model = rebuilt(ReleasedModel, config["model"])
+        model = rebuilt(ReleasedModel, {"in_order": False, **config["model"]})  # older folders do not say it
         found = found or load_checkpoint(released, jnp.dtype(model.dtype), progress)
         adapters, lora = load_adapters(folder, found.config)
         policy = build_released_policy(_without_sensors(model), found, tuple(config["sensors"]))

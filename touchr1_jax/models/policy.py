@@ -78,6 +78,13 @@ class PolicyConfig:
     tactile: TactileViTConfig
     vision: ViewConfig
     decoder: DecoderConfig
+    in_order: bool = False
+    """Number a prompt's tokens one by one, as a server does that is sent their embeddings alone."""
+
+    @property
+    def grid(self) -> int | None:
+        """Tokens in a row of the view, where rows and columns count as positions."""
+        return None if self.in_order else self.vision.grid
 
 
 class Policy(nn.Module):
@@ -161,10 +168,9 @@ class Policy(nn.Module):
         start: int = 0,
     ) -> tuple[Float[Array, "D"], PrefixCache]:
         """As `prefill`, but the hidden state that the first token's logits are made of."""
-        x = self.decoder.embed(ids)
-        x = x.at[slots.touch].set(features.touch.astype(x.dtype)).at[slots.view].set(features.view.astype(x.dtype))
+        x = with_features(self.decoder.embed(ids), features, slots)
         mask = prompt_mask(features, mask, slots)
-        positions = prompt_positions(features.touch_time, mask, slots, self.config.vision.grid)
+        positions = prompt_positions(features.touch_time, mask, slots, self.config.grid)
         return self.decoder.prefill(x, positions, mask, known, start)
 
     def completion_states(
@@ -247,6 +253,11 @@ def init_policy(
     return init(key, jax.tree.map(lambda x: x[:1], batch))["params"]
 
 
+def with_features(x: Float[Array, "L D"], features: Features, slots: Slots) -> Float[Array, "L D"]:
+    """Embedded words of a prompt, with tactile and view tokens in their places."""
+    return x.at[slots.touch].set(features.touch.astype(x.dtype)).at[slots.view].set(features.view.astype(x.dtype))
+
+
 def prompt_mask(features: Features, mask: Bool[Array, "L"], slots: Slots) -> Bool[Array, "L"]:
     """Which prompt tokens exist: real text, names of present streams, tokens of their recorded steps, any view."""
     felt = features.stream_mask[:, None] & (features.touch_time >= 0)
@@ -257,17 +268,19 @@ def prompt_mask(features: Features, mask: Bool[Array, "L"], slots: Slots) -> Boo
 
 
 def prompt_positions(
-    touch_time: Int[Array, "S N"], mask: Bool[Array, "L"], slots: Slots, grid: int
+    touch_time: Int[Array, "S N"], mask: Bool[Array, "L"], slots: Slots, grid: int | None
 ) -> Int[Array, "3 L"]:
     """(time, row, column) id of each prompt token, block by block as Qwen2.5-VL counts them.
 
     A text token advances all three by one.  A view token keeps the time of its block and adds its row and column.  A
     tactile token adds its frame index to the time of its block and its number within the step to the column.  A block
     starts after the largest id before it, and tokens that do not exist advance nothing, so padding changes no position.
+    Without a grid all tokens count as text.
     """
     owner = np.full(mask.shape[0], -1)
-    owner[slots.view] = 0
-    owner[slots.touch] = 1 + np.arange(len(slots.touch))[:, None]
+    if grid is not None:
+        owner[slots.view] = 0
+        owner[slots.touch] = 1 + np.arange(len(slots.touch))[:, None]
     starts = np.flatnonzero(np.diff(owner, prepend=-2))
     base, blocks = jnp.zeros((), jnp.int32), []
     for begin, end in zip(starts, [*starts[1:], len(owner)], strict=True):
@@ -277,7 +290,7 @@ def prompt_positions(
             local = jnp.stack([index, index, index])
         elif owner[begin] == 0:
             cell = np.arange(end - begin)
-            local = jnp.stack([jnp.zeros_like(cell), cell // grid, cell % grid])
+            local = jnp.stack([jnp.zeros_like(cell), cell // (grid or 1), cell % (grid or 1)])
         else:
             time = touch_time[owner[begin] - 1]
             column = np.concatenate([[0], np.cumsum(np.ones(end - begin - 1, int))])

@@ -35,6 +35,8 @@ class ReleasedModel(TouchConfig):
     view_px: int = 224
     """Rows and columns of the object's picture; the released vision tower makes one token of 28² pixels."""
     dtype: Literal["bfloat16", "float32"] = "bfloat16"
+    in_order: bool = False
+    """Number a prompt's tokens one by one, as a server does that draws rollouts from their embeddings alone."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -97,7 +99,8 @@ def build_released_policy(model: ReleasedModel, found: Checkpoint, sensors: tupl
             "tokenizer; raise it, and grpo.length with it"
         )
     tactile = dataclasses.replace(model.tactile, sensors=len(sensors))
-    policy = qwen_policy(found.config, tactile, (model.view_px, model.view_px), found.budget)
+    view_px = (model.view_px, model.view_px)
+    policy = qwen_policy(found.config, tactile, view_px, found.budget, in_order=model.in_order)
     view = policy.config.vision
     assert isinstance(view, QwenViewConfig)
     layout = build_chat_layout(

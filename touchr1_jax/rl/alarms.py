@@ -187,6 +187,12 @@ def gamed_answers(now: Metrics, start: Metrics) -> float | None:
     return now["gamed_share"]
 
 
+def sampler_mismatch(now: Metrics, start: Metrics) -> float | None:
+    """F16: mean |log π_learner − log π_sampler| of a token, nat."""
+    del start
+    return now.get("sampler_gap")
+
+
 RULES: tuple[AlarmRule, ...] = (
     AlarmRule(
         code="F1",
@@ -303,6 +309,14 @@ RULES: tuple[AlarmRule, ...] = (
         bound=0.1,
         reason="one update in ten is lost; a single one may be a rare overflow",
         check=left_out_updates,
+        at_once=True,
+    ),
+    AlarmRule(
+        code="F16",
+        meaning="the sampler is not the learner's policy",
+        bound=0.1,
+        reason="ten times what bfloat16 rounds a token off; beyond it weights, positions or a temperature differ",
+        check=sampler_mismatch,
         at_once=True,
     ),
 )

@@ -81,6 +81,10 @@ class Algorithm:
     """Largest weight of a token for π_learner/π_sampler (truncated importance sampling); `None` trusts the sampler."""
     importance_sequence: bool = False
     """Weight whole rollouts by the product of their ratios, at most `importance_cap`, instead of each token."""
+    mismatch_limit: float | None = None
+    """Largest mean |log π_learner − log π_sampler| of a rollout, nat a token; a rollout beyond it is left out."""
+    score_centering: int = 0
+    """Most likely tokens of the sampler, from which the drift towards it is computed and subtracted; 0 leaves it in."""
     average: Average = Average.ROLLOUT
     advantage: Advantage = Advantage.GROUP
     """Mean and σ that a reward is compared with: the group's, one σ for the batch, none, …"""
@@ -155,15 +159,15 @@ class Algorithm:
                 raise ValueError(f"{field} is {getattr(self, field)}: {needs}")
         if not self.learn_conclusion and self.enumerated is None:
             raise ValueError("learn_conclusion is False, but enumerated is None: must be set; choose a norm for it")
-        if self.stale < 0:
-            raise ValueError(f"stale is {self.stale}: must be ≥ 0 steps; 0 samples with the learner's own parameters")
+        at_least(self, 0, "stale", "score_centering")
         if not 0 < self.reference_share <= 1:
             raise ValueError(f"reference_share is {self.reference_share}: must lie in 0 < share ≤ 1; 1 is no average")
         sizes = ("clip_low", "clip_high", "epsilon", "beta", "entropy_weight", "gamma", "anchor", "tactile_weight")
         for field in sizes:
             if not (isinstance(getattr(self, field), jax.Array) or getattr(self, field) >= 0):
                 raise ValueError(f"{field} is {getattr(self, field)}: must be ≥ 0; it is a size, not a sign")
-        for field in ("importance_cap", "grounding_cap_nat", "grounding_budget", "entropy_floor_nat", "trust_nat"):
+        bounds = "importance_cap mismatch_limit grounding_cap_nat grounding_budget entropy_floor_nat trust_nat"
+        for field in bounds.split():
             bound = getattr(self, field)
             if bound is not None and not bound > 0:
                 raise ValueError(f"{field} is {bound}: must be above 0; None leaves it out")
@@ -388,12 +392,9 @@ def preset_name(config: GRPOConfig) -> str:
     """Name of the algorithm's preset, and what differs from it and from the default sizes, as reports print it."""
     algorithm, preset = config.algorithm, type(config.algorithm)()
     names = [f.name for f in dataclasses.fields(Algorithm)]
-    changes = [f"{f}={_word(getattr(algorithm, f))}" for f in names if getattr(algorithm, f) != getattr(preset, f)]
+    word = lambda value: value.value if isinstance(value, enum.Enum) else value
+    changes = [f"{f}={word(getattr(algorithm, f))}" for f in names if getattr(algorithm, f) != getattr(preset, f)]
     default = GRPOConfig(algorithm=algorithm)
     names = [f.name for f in dataclasses.fields(GRPOConfig) if f.name != "algorithm"]
     changes += [f"{f}={getattr(config, f)}" for f in names if getattr(config, f) != getattr(default, f)]
     return " ".join([type(algorithm).__name__.lower(), *([f"with {', '.join(changes)}"] if changes else [])])
-
-
-def _word(value: object) -> object:
-    return value.value if isinstance(value, enum.Enum) else value

@@ -83,7 +83,8 @@ def grpo_gradient(
         a = micro.advantage if micro.token_advantage is None else micro.token_advantage
         answer = None if left_out(algorithm.anchor) else answer_likelihood(fns, config, params, micro.batch)
         rollouts = old, rollout.log_prob, rollout.mask, a, w
-        value, parts = grpo_loss(terms, *rollouts, config, longest, answer, micro.levels)
+        head = None if rollout.head_log_prob is None else jnp.moveaxis(rollout.head_log_prob, -2, -1)
+        value, parts = grpo_loss(terms, *rollouts, config, longest, answer, micro.levels, head)
         parts |= {"loss": value} if answer is None else {"loss": value, "answer_likelihood": answer}
         return value, (parts, old)
 
@@ -179,6 +180,8 @@ def prompt_terms(
     states = group_states(fns, config, experience.batch, experience.rollout.tokens)
     own, prefix = states(params, batch.features)
     rows: Rows = {"own": own, "token": tokens}
+    if algorithm.score_centering and experience.rollout.head_ids is not None:
+        rows["head"] = jnp.moveaxis(experience.rollout.head_ids, -2, -1)
     if not left_out(loss_beta(algorithm)):
         rows["reference"] = jax.lax.stop_gradient(states(reference, batch.features)[0])
     if not left_out(algorithm.gamma):
@@ -188,13 +191,13 @@ def prompt_terms(
 
     def of_rows(rows: Rows) -> TokenTerms:
         logits = {name: fns.logits(p, rows[name]) for name, p in heads.items() if name in rows}
-        return logit_terms(config, rows["token"], logits)
+        return logit_terms(config, rows["token"], logits, rows.get("head"))
 
     if config.remat:
         of_rows = jax.checkpoint(of_rows, policy=jax.checkpoint_policies.dots_with_no_batch_dims_saveable)
     rows = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
     found = by_blocks(of_rows, rows, width=len(fns.banned), most=config.max_logits)
-    terms = jax.tree.map(lambda x: x.reshape(tokens.shape), found)
+    terms = jax.tree.map(lambda x: x.reshape(*tokens.shape, *x.shape[1:]), found)
     if experience.levels is None:
         return terms
     return terms._replace(level_log_prob=level_log_probs(fns, config, heads["own"], own, experience.levels))
@@ -209,10 +212,20 @@ def level_log_probs(
     return jnp.where(levels.ids >= 0, log_p[:, levels.ids], -jnp.inf)
 
 
-def logit_terms(config: GRPOConfig, tokens: Int[Array, "*n"], logits: Mapping[str, Float[Array, "*n V"]]) -> TokenTerms:
-    """`token_terms` from logits of the policies `own` and, where they are run, `reference` and `perturbed`."""
+def logit_terms(
+    config: GRPOConfig,
+    tokens: Int[Array, "*n"],
+    logits: Mapping[str, Float[Array, "*n V"]],
+    head: Int[Array, "*n K"] | None = None,
+) -> TokenTerms:
+    """`token_terms` from logits of the policies `own` and, where they are run, `reference` and `perturbed`.
+
+    `head` are the sampler's most likely tokens, where scores are centered.
+    """
     log = {name: jax.nn.log_softmax(tempered(x, config.temperature)) for name, x in logits.items()}
     terms = token_terms(config.algorithm, tokens, log["own"], log.get("reference"), log.get("perturbed"))
+    if head is not None:
+        terms = terms._replace(head_log_prob=jnp.take_along_axis(log["own"], head, -1))
     if not truncates(config.top_p, config.min_p):
         return terms
     return terms._replace(log_prob=drawn_log_probs(log["own"], tokens, config.top_p, config.min_p))

@@ -227,7 +227,9 @@ class GRPOEngine:
         algorithm = self.config.algorithm
         fns, params = self.fns.with_context(self.gather), self.gather(at_precision(self.config, params))
         prompts = encode_prompts(fns, params, batch)
-        rollout = sample_prompts(fns, params, prompts, key, self.draw(self.config.group))
+        rollout = batch.rollout
+        if rollout is None:
+            rollout = sample_prompts(fns, params, prompts, key, self.draw(self.config.group))
         score = jax.vmap(jax.vmap(self.score, in_axes=(0, None), axis_name=GROUP))
         reward, terms, parsed = score(rollout.tokens, batch.target)
         reward, terms, finite, left_out = left_out_groups(reward, terms)

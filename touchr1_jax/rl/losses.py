@@ -11,11 +11,23 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax import masked
-from touchr1_jax.rl.config import Algorithm, Average, GRPOConfig, KLEstimator, Surrogate, left_out, loss_beta
+from touchr1_jax.rl.config import (
+    Algorithm,
+    Average,
+    GRPOConfig,
+    KLEstimator,
+    Surrogate,
+    left_out,
+    loss_beta,
+    ratio_to_learner,
+)
 from touchr1_jax.rl.enumerated import ExactTerms, LevelRewards, before_level, conclude_exactly, exact_terms
 
 LOG_RATIO_CLAMP = 20.0
 """Bound of a log-ratio before `exp`: e^20 is far past any meaning and far from float32 overflow."""
+
+LEAST_TAIL = 1e-6
+"""Least probability of all tokens past the head: in float32 1 − Σ p rounds to 0 or below."""
 
 
 class TokenTerms(NamedTuple):
@@ -31,6 +43,8 @@ class TokenTerms(NamedTuple):
     """Entropy of π, nat."""
     level_log_prob: Float[Array, "*g K"] | None = None
     """log π of each level at the place where a rollout concludes, −∞ past the last one; only where it is enumerated."""
+    head_log_prob: Float[Array, "*n K"] | None = None
+    """log π of the sampler's most likely tokens; only where scores are centered."""
 
 
 def grpo_loss(
@@ -44,6 +58,7 @@ def grpo_loss(
     longest: int | Float[Array, ""] | None = None,
     answer: Float[Array, "P"] | None = None,
     levels: LevelRewards | None = None,
+    head: Float[Array, "P G T K"] | None = None,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, "P"]]]:
     """Loss −J of a micro-batch of groups, which adds up to that of the step over all of them.
 
@@ -56,8 +71,7 @@ def grpo_loss(
 
     Args:
       terms: log-probability, reference KL, grounding G and entropy H of every token, [P, G, T].
-      old: log-probabilities that ratios are taken to.
-      sampler: log-probabilities that the tokens were drawn with.
+      old, sampler: log-probabilities that ratios are taken to, and those that the tokens were drawn with.
       mask: which tokens exist.
       advantage: A of each rollout, or of each of its tokens.
       weight: w, the weight of each prompt's policy gradient; 0 leaves the prompt out.
@@ -65,14 +79,16 @@ def grpo_loss(
       longest: `divisor` of the whole batch; by default that of these rollouts.
       answer: L, the mean log-likelihood of a token of each verified answer; `None` where λ = `anchor` is 0.
       levels: rewards of every conclusion, where it is enumerated: they replace `advantage` (see `enumerated`).
+      head: log-probabilities of the sampler's most likely tokens, where scores are centered.
 
     Returns:
       The loss, and per prompt the averages that it is made of, the largest KL and grounding of a token, the share of
-      clipped tokens, and the mean and the largest |log π(o_t) − log π_sampler(o_t)|.
+      clipped tokens, and `mismatch_parts` of learner and sampler.
     """
-    algorithm = config.algorithm
+    algorithm, dropped = config.algorithm, too_far(config.algorithm, old - sampler, mask)
     longest = divisor(config, mask) if longest is None else longest
-    objective, clipped, expected = policy_objective(algorithm, terms, old, sampler, mask, advantage, levels)
+    drawn, mask = mask, mask & ~dropped[..., None]
+    objective, clipped, expected = policy_objective(algorithm, terms, old, sampler, mask, advantage, levels, head)
     policy, kl = (group_mean(algorithm.average, x, mask, longest) for x in (objective, terms.reference_kl))
     per_rollout = lambda x: group_mean(Average.ROLLOUT, x, mask, longest)
     grounding, entropy = per_rollout(terms.grounding), per_rollout(terms.entropy)
@@ -80,7 +96,6 @@ def grpo_loss(
     explored = algorithm.entropy_weight * at_most(entropy, algorithm.entropy_floor_nat)
     further = grounded - loss_beta(algorithm) * kl + explored + (0.0 if answer is None else algorithm.anchor * answer)
     gain = jnp.sum(weight * policy) + jnp.sum(further) / config.prompts
-    gap = jnp.abs(jax.lax.stop_gradient(terms.log_prob) - sampler)
     peak = lambda x: jnp.max(jnp.where(mask, jax.lax.stop_gradient(x), 0.0), (-2, -1))
     return -gain, expected | {
         "surrogate": policy,
@@ -90,8 +105,7 @@ def grpo_loss(
         "grounding_peak": peak(terms.grounding),
         "entropy": entropy,
         "clip_share": per_rollout(clipped.astype(jnp.float32)),
-        "sampler_gap": per_rollout(gap),
-        "sampler_gap_peak": peak(gap),
+        **mismatch_parts(jax.lax.stop_gradient(terms.log_prob) - sampler, drawn, dropped),
     }
 
 
@@ -103,10 +117,11 @@ def policy_objective(
     mask: Bool[Array, "P G T"],
     advantage: Float[Array, "P G *t"],
     levels: LevelRewards | None,
+    head: Float[Array, "P G T K"] | None = None,
 ) -> tuple[Float[Array, "P G T"], Bool[Array, "P G T"], dict[str, Float[Array, "P"]]]:
     """c_t S_t of every token, where the clip cut its gradient off, and each prompt's mean E where it is enumerated.
 
-    Arguments are those of `grpo_loss`.
+    With score centering A times `expected_score` is subtracted.  Arguments are those of `grpo_loss`.
     """
     exact = None if levels is None else exact_levels(algorithm, terms, levels)
     trace = mask if levels is None else before_level(mask, levels.at)
@@ -114,6 +129,10 @@ def policy_objective(
     objective, clipped = surrogate(algorithm, terms.log_prob, old, trace, a)
     if algorithm.importance_cap is not None:
         objective *= jnp.minimum(importance(algorithm, old - sampler, mask), algorithm.importance_cap)
+    if algorithm.score_centering:
+        check_centering(algorithm)
+        wide = advantage if advantage.ndim == mask.ndim else advantage[..., None]
+        objective -= wide * expected_score(algorithm, terms.head_log_prob, head)
     if levels is None or exact is None:
         return objective, clipped, {}
     expected = {"expected_reward": jnp.mean(exact.expected, -1)}
@@ -146,6 +165,75 @@ def importance(
     if algorithm.importance_sequence:
         log_ratio = jnp.broadcast_to(masked.total(log_ratio, mask, -1, keepdims=True), log_ratio.shape)
     return _ratio(log_ratio)
+
+
+def too_far(algorithm: Algorithm, log_ratio: Float[Array, "*n T"], mask: Bool[Array, "*n T"]) -> Bool[Array, "*n"]:
+    """Rollouts whose mean |log π_old − log π_sampler| of a token is above `mismatch_limit`.
+
+    Departure from the geometric mask of a sequence (Liu et al. 2025, "When speed kills stability"; SkyRL), which bounds
+    |mean log π_old / π_sampler|: here tokens that are too likely do not make up for others that are too unlikely.
+    """
+    if algorithm.mismatch_limit is None:
+        return jnp.zeros(mask.shape[:-1], bool)
+    return masked.mean(jnp.abs(log_ratio), mask, -1) > algorithm.mismatch_limit
+
+
+def mismatch_parts(
+    gap: Float[Array, "P G T"], mask: Bool[Array, "P G T"], dropped: Bool[Array, "P G"]
+) -> dict[str, Float[Array, "P"]]:
+    """Mean and largest |gap| of the drawn tokens of each prompt, and its share of dropped rollouts."""
+    return {
+        "sampler_gap": jnp.mean(masked.mean(jnp.abs(gap), mask, -1), -1),
+        "sampler_gap_peak": jnp.max(jnp.where(mask, jnp.abs(gap), 0.0), (-2, -1)),
+        "dropped_share": jnp.mean(dropped, -1),
+    }
+
+
+def check_centering(algorithm: Algorithm) -> None:
+    """Refuse what score centering is not defined for: ratios other than 1, conclusions that are not sampled.
+
+    Raises:
+      ValueError: naming the field.
+    """
+    wanted = {"surrogate": Surrogate.TOKEN, "importance_sequence": False, "updates": 1, "minibatches": 1}
+    for field, value in {**wanted, "enumerated": None}.items():
+        if getattr(algorithm, field) != value:
+            raise ValueError(
+                f"{field} is {getattr(algorithm, field)}: must be {value} where score_centering is set; change either"
+            )
+    if not ratio_to_learner(algorithm):
+        raise ValueError(f"stale is {algorithm.stale}: must be 0 for score_centering without importance_cap; set a cap")
+
+
+def expected_score(
+    algorithm: Algorithm, log_p: Float[Array, "*n K"] | None, log_q: Float[Array, "*n K"] | None
+) -> Float[Array, "*n"]:
+    """A number whose gradient is the mean score E_q[w ∇log p] under the sampler q, by its K most likely tokens.
+
+        Σ_v sg(q_v w_v − α p_v) log p_v,   w = min(p/q, cap),   α = r min(1/r, cap),   r = (1 − Σ q) / (1 − Σ p)
+
+    Without a cap w is 1 and α = r.  Tokens past the K are taken for r p.  Subtracted from the score of each drawn token
+    it leaves Cov_q(A, w ∇log p) of E_q[A w ∇log p], and takes off the drift of the learner towards a sampler that
+    differs: score centering (Marek & Ryabinin, arXiv 2609.20807, eq. 3 and 7 to 12).
+
+    Args:
+      algorithm: its `importance_cap` is the cap.
+      log_p: the learner's log-probabilities of these tokens.
+      log_q: the sampler's.
+
+    Raises:
+      ValueError: rollouts without the sampler's most likely tokens.
+    """
+    if log_p is None or log_q is None:
+        raise ValueError(
+            "score_centering is set, but rollouts lack the sampler's most likely tokens, which a server returns; "
+            "set rollouts.url, or score_centering 0"
+        )
+    p, q, cap = jnp.exp(jax.lax.stop_gradient(log_p)), jnp.exp(log_q), algorithm.importance_cap
+    tail = lambda x: jnp.maximum(1 - jnp.sum(x, -1, keepdims=True), LEAST_TAIL)
+    ratio = tail(q) / tail(p)
+    weighted, alpha = (q, ratio) if cap is None else (jnp.minimum(p, cap * q), jnp.minimum(1.0, cap * ratio))
+    return jnp.sum((weighted - alpha * p) * log_p, -1)
 
 
 def surrogate(

@@ -39,6 +39,8 @@ class GRPOBatch:
     answer: Int[Array, "P T"] | None = None
     """Verified answers, whose likelihood an anchor raises; `None` where there is no anchor."""
     answer_mask: Bool[Array, "P T"] | None = None
+    rollout: Rollout | None = None
+    """Completions that another program drew, [P, G, T]; `None` lets the step draw them."""
 
 
 class EncodedPrompts(NamedTuple):

@@ -195,7 +195,7 @@ def padded_tokens(
     def positions(seen: Features, mask: Array, streams: Array) -> Array:
         seen = dataclasses.replace(seen, stream_mask=seen.stream_mask & streams)
         exists = prompt_mask(seen, mask, slots)
-        prompt = prompt_positions(seen.touch_time, exists, slots, policy.config.vision.grid)
+        prompt = prompt_positions(seen.touch_time, exists, slots, policy.config.grid)
         after = jnp.max(jnp.where(exists, prompt, -1)) + 1 + jnp.arange(t)
         return jnp.concatenate([prompt, jnp.broadcast_to(after, (3, t))], -1)
 

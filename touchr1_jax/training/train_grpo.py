@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from touchr1_jax.models.lora import of_decoder, with_adapters
 from touchr1_jax.models.policy_fns import PolicyFns
+from touchr1_jax.models.released_policy import ReleasedPolicy
 from touchr1_jax.models.stacked import ADAPTERS, layer_by_layer
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.rewards import AnyReward, check_weights, total_reward
@@ -27,6 +28,7 @@ from touchr1_jax.text.language import Language
 from touchr1_jax.text.template import LevelTokens
 from touchr1_jax.training.loop import SILENT, Batches, Hooks, LoopConfig, fit, peek
 from touchr1_jax.training.optimizer import falling_adamw
+from touchr1_jax.training.rollout_server import RolloutServer
 from touchr1_jax.training.train_sft import joined
 from touchr1_jax.types import Params, Parsed, Target
 
@@ -42,6 +44,7 @@ def train_grpo(
     *,
     noise: Float[Array, "K S N D"],
     seed: int = 0,
+    rollouts: RolloutServer | None = None,
 ) -> Params:
     """Reinforce the decoder of a policy by GRPO; both encoders stay as they are, and the reference is where it starts.
 
@@ -57,9 +60,11 @@ def train_grpo(
       hooks: log, checkpoints, devices.
       noise: encoded noise streams of the policy's encoder (`encoding.noise_bank`).
       seed: of rollouts, and of adapters where there are none yet.
+      rollouts: server that draws them, of a policy on released weights; by default the step does.
 
     Raises:
-      ValueError: a first batch without touch, a stream whose touch does not reach the policy.
+      ValueError: a first batch without touch, a stream whose touch does not reach the policy; as `RolloutServer.check`.
+      RolloutError: as `RolloutServer.rollouts`.
     """
     constraint = policy.constraint if config.algorithm.constrained else None
     levels = None if config.algorithm.enumerated is None else policy.level_tokens
@@ -75,6 +80,9 @@ def train_grpo(
     state = start_state(trained, optimizer, jax.random.key(seed), config)
     constants = FrozenInputs(reference=trained, noise=noise), base
     step, state, batches = hooks.devices.shard(step, state, batches, config.drawn, *constants)
+    if rollouts is not None:
+        assert isinstance(policy, ReleasedPolicy)
+        step = rollouts.before(step, policy, start["decoder"]["embedding"]["embedding"], config, hooks.devices)
     return joined(whole, hooks.devices.gather(fit(step, state, batches, loop, hooks).params))
 
 

@@ -16,8 +16,12 @@ from experiments.core.results import Estimate
 from experiments.core.runner import main
 from experiments.paper.touch_r1 import ARM, DRAWN, SMALL, SMOKE, TAUGHT, WRITTEN, ZERO, verdict
 from experiments.study.study import BLIND, CONTINUED, SFT
+from sensors_io.schema import SENSORS
 from tests.experiments.shrunk import only_run
+from tests.touchr1_jax.training.stand_in import COMPLETE, StandIn
 from touchr1_jax.bench.grounding import CONTROLS
+from touchr1_jax.models.load import load_checkpoint
+from touchr1_jax.models.released_policy import build_released_policy
 
 
 @pytest.mark.parametrize(
@@ -32,6 +36,36 @@ def test_a_folder_without_weights_is_named_before_data_are_made(tmp_path, capsys
     assert main(["touch_r1", *places, *([] if weights is None else ["--weights", str(tmp_path / weights)])]) == 1
     assert "".join(message.split()) in "".join(capsys.readouterr().err.split())
     assert not list((tmp_path / "data").glob("scenes-*"))
+
+
+def test_a_server_that_is_not_there_is_named_before_data_are_made(tmp_path, weights, capsys):
+    places = ["--runs-dir", str(tmp_path / "runs"), "--cache-dir", str(tmp_path / "data")]
+    server = ["--rollouts.url", "http://127.0.0.1:9", "--rollouts.tries", "1"]
+    assert main(["touch_r1", "--scale", "smoke", *places, "--weights", str(weights), *server]) == 1
+    message = "http://127.0.0.1:9/v1/models gave no answer in 1 tries, the last ended in URLError"
+    assert "".join(message.split()) in "".join(capsys.readouterr().err.split())
+    assert not list((tmp_path / "data").glob("scenes-*"))
+
+
+@pytest.mark.slow
+def test_a_server_draws_the_rollouts_of_the_smoke_run(tmp_path, weights):
+    """With a policy in bfloat16 whose decoder is the same on both sides."""
+    model = dataclasses.replace(SMOKE.model, in_order=True)
+    with StandIn(build_released_policy(model, load_checkpoint(weights), SENSORS)) as server:
+        places = ["--runs-dir", str(tmp_path / "runs"), "--cache-dir", str(tmp_path / "data")]
+        options = ["--weights", str(weights), "--rollouts.url", server.url, "--grpo.algorithm.importance-cap", "2"]
+        options += ["--grpo.algorithm.mismatch-limit", "0.5", "--grpo.algorithm.score-centering", "16"]
+        assert main(["touch_r1", "--scale", "smoke", *places, *options]) == 0
+        asked = [body for path, body in server.requests if path == COMPLETE]
+    assert len(asked) == SMOKE.grpo_steps * SMOKE.grpo.prompts
+    assert {body["logprobs"] for body in asked} == {16}
+    directory = only_run(tmp_path / "runs", "touch_r1")
+    assert read_json(directory / "results.json")["settings"]["rollouts"] == server.url
+    lines = [json.loads(line) for line in (directory / "metrics.jsonl").read_text().splitlines()]
+    steps = [line for line in lines if line["stage"] == f"grpo/{ARM}/0"]
+    assert len(steps) == SMOKE.grpo_steps
+    assert all(0 < line["sampler_gap"] < 0.05 and line["dropped_share"] == 0 for line in steps)
+    assert json.loads((directory / "policies" / ARM / "0" / "config.json").read_text())["model"]["in_order"]
 
 
 @pytest.mark.parametrize(("config", "first"), [(SMOKE, DRAWN), (SMALL, TAUGHT)])

@@ -56,6 +56,12 @@ def test_positions_without_a_stream_by_hand():
     np.testing.assert_array_equal(ours.T[mask], moved[mask])
 
 
+def test_positions_in_order_by_hand():
+    """One by one, and what does not exist takes no room: a server that is sent the others numbers them alike."""
+    ours = prompt_positions(jnp.asarray(TIME), jnp.asarray(HAND_MASK), SLOTS, grid=None)
+    np.testing.assert_array_equal(ours[:, HAND_MASK], np.tile(np.arange(HAND_MASK.sum()), (3, 1)))
+
+
 def test_time_ids_are_distinct_frame_indices():
     """Zero or repeated time ids would make the shuffle control vacuous."""
     index = np.array([[[0, 4, 9, 17], [1, 2, 3, 30]]])

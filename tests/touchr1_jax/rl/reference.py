@@ -112,6 +112,19 @@ def nucleus(p: Float, top_p: float, min_p: float) -> NDArray[np.bool_]:
     return kept
 
 
+def drift(algorithm, log_p, still, fixed) -> Float:
+    """What score centering subtracts at advantage 1, token by token, 0 without it; `still` has no gradient."""
+    found, cap = np.zeros(fixed["tokens"].shape), algorithm.importance_cap or np.inf
+    for at in np.ndindex(found.shape) if algorithm.score_centering else ():
+        head, p, q = fixed["head"][at], np.exp(still[at]), np.exp(fixed["head_q"][at])
+        tail = (1 - q.sum()) / (1 - p[head].sum())
+        w = np.ones(len(head)), 1.0
+        if cap < np.inf:
+            w = np.minimum(p[head] / q, cap), min(1 / tail, cap)
+        found[at] = ((q * w[0] - tail * w[1] * p[head]) * log_p[at][head]).sum()
+    return found
+
+
 def objective(config, own, perturbed, fixed, *, first: bool) -> float:
     """The loss from logits [P, G, T, V] in float64, term by term as published.
 
@@ -140,13 +153,17 @@ def objective(config, own, perturbed, fixed, *, first: bool) -> float:
     if a.importance_sequence:
         log_c = np.broadcast_to((log_c * mask).sum(-1, keepdims=True), log_c.shape)
     c = 1.0 if a.importance_cap is None else np.minimum(np.exp(log_c), a.importance_cap)
-    advantage, length = fixed["advantage"][..., None], mask.sum(-1)
+    if a.mismatch_limit is not None:
+        far = (np.abs(old - fixed["sampler"]) * mask).sum(-1) / mask.sum(-1) > a.mismatch_limit
+        mask = mask & ~far[..., None]
+    advantage, length = fixed["advantage"][..., None], np.maximum(mask.sum(-1), 1)
     ratio, low, high = np.exp(here - old), 1 - a.clip_low, 1 + a.clip_high
     if a.surrogate.value == "sequence":
         ratio = np.exp(((here - old) * mask).sum(-1, keepdims=True) / length[..., None]) * np.ones_like(here)
     policy = np.minimum(ratio * advantage, np.clip(ratio, low, high) * advantage)
     if a.surrogate.value == "cispo":
         policy = np.clip(np.exp(then - old), low, high) * advantage * here
+    policy = c * policy - advantage * drift(a, log_p, still, fixed)
     log_r = of_tokens(log_ref, tokens) - of_tokens(log_p, tokens)
     p = np.exp(log_p)
     kl = {"k1": -log_r, "k2": log_r**2 / 2, "k3": np.exp(log_r) - 1 - log_r, "exact": (p * (log_p - log_ref)).sum(-1)}
@@ -160,7 +177,7 @@ def objective(config, own, perturbed, fixed, *, first: bool) -> float:
         "batch": lambda x: sums(x).mean(-1) / length.mean(),
         "length": lambda x: sums(x).mean(-1) / config.length,
     }[a.average.value]
-    gain = (fixed["weight"] * average(c * policy)).sum()
+    gain = (fixed["weight"] * average(policy)).sum()
     beta = 0.0 if a.kl_in_reward else a.beta
     grounded = np.minimum(a.gamma * per_rollout(grounding), a.grounding_budget or np.inf)
     entropy = np.minimum(per_rollout(-(p * log_p).sum(-1)), a.entropy_floor_nat or np.inf)

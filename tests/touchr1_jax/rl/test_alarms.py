@@ -36,6 +36,7 @@ HEALTHY = {
     "gamed_share": 0.05,
     "touch_share": 1.0,
     "nonfinite_share": 0.0,
+    "sampler_gap": 0.007,
     "drawn_degenerate_share": 0.6,
     "drawn_all_right_share": 0.5,
     "drawn_accuracy": 0.7,
@@ -57,6 +58,7 @@ FAILURES = [
     ("F10", {"touch_share": 0.0}, 0.0),
     ("F13", {"gamed_share": 0.5}, 0.5),
     ("F15", {"nonfinite_share": 0.1}, 0.1),
+    ("F16", {"sampler_gap": 0.4}, 0.4),
 ]
 
 
@@ -76,7 +78,7 @@ def test_each_failure_fires_its_alarm_alone(code, change, value):
 
 
 def test_all_codes_are_covered():
-    codes = {f"F{k}" for k in (*range(1, 11), 12, 13, 15)}
+    codes = {f"F{k}" for k in (*range(1, 11), 12, 13, 15, 16)}
     assert {rule.code for rule in RULES} == codes == {code for code, _, _ in FAILURES}
 
 

@@ -12,10 +12,12 @@ from touchr1_jax.rl.config import Average, GRPOConfig, Paper, Stable, Surrogate
 from touchr1_jax.rl.losses import (
     TokenTerms,
     at_most,
+    check_centering,
     divisor,
     entropy,
     estimated_kl,
     exact_kl,
+    expected_score,
     group_mean,
     grpo_loss,
     reference_kl,
@@ -303,3 +305,79 @@ def test_reference_kl_by_the_configured_estimator(estimator):
     expected = exact_kl(log_p, log_ref) if estimator == "exact" else estimated_kl(here, there, estimator)
     np.testing.assert_array_equal(ours, expected)
     np.testing.assert_array_equal(reference_kl(estimator, log_p, log_ref, tokens), expected)
+
+
+DRIFTED = np.array([[[2.0, 0.5, 9.0], [3.0, 3.0, 1.0]]])
+"""π_old/π_sampler of two rollouts; the last token of the first does not exist."""
+
+
+@pytest.mark.parametrize(
+    ("options", "loss", "dropped"),
+    [
+        ({}, 0.0, 0.0),  # −(1 − 1) / 2
+        ({"importance_cap": 1.5}, 1 / 6, 0.0),  # −((1.5 + .5) / 2 − (1.5 + 1.5 + 1) / 3) / 2
+        ({"importance_cap": 1.5, "importance_sequence": True}, 0.25, 0.0),  # −(1 − 1.5) / 2, of products 1 and 9
+        ({"mismatch_limit": 0.7}, -0.5, 0.5),  # log 2 = .69 a token stays, 2 log 3 / 3 = .73 goes
+        ({"mismatch_limit": 0.69}, 0.0, 1.0),
+        ({"mismatch_limit": 0.74, "importance_cap": 1.5}, 1 / 6, 0.0),
+    ],
+)
+def test_weights_and_dropped_rollouts_by_hand(options, loss, dropped):
+    log_prob, mask = jnp.full((1, 2, 3), -1.0), jnp.asarray([[[True, True, False], [True, True, True]]])
+    terms = TokenTerms(log_prob, *(jnp.zeros((1, 2, 3)),) * 3)
+    config = GRPOConfig(prompts=1, micro_prompts=1, group=2, length=3, algorithm=Paper(beta=0.0, gamma=0.0, **options))
+    sampler = log_prob - jnp.log(jnp.asarray(DRIFTED))
+    found, parts = grpo_loss(terms, log_prob, sampler, mask, jnp.array([[1.0, -1.0]]), jnp.ones(1), config)
+    assert float(found) == pytest.approx(loss, abs=1e-6)
+    assert float(parts["dropped_share"][0]) == dropped
+    assert float(parts["sampler_gap"][0]) == pytest.approx((np.log(2) + 2 * np.log(3) / 3) / 2, rel=1e-6)
+    assert float(parts["sampler_gap_peak"][0]) == pytest.approx(np.log(3), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("cap", "slopes"), [(None, [0.1, -0.1]), (2.0, [0.0, 0.0]), (1.0, [0.0, -0.1])], ids=["no cap", "2", "1"]
+)
+def test_the_expected_score_by_hand(cap, slopes):
+    """q = .5, .3 and p = .4, .4 leave both .2: r = 1.  At a cap of 1 only min(.4, .3) − .4 is left."""
+    log_p, log_q = jnp.log(jnp.array([0.4, 0.4])), jnp.log(jnp.array([0.5, 0.3]))
+    algorithm = Paper(score_centering=2, importance_cap=cap)
+    found = jax.grad(lambda x: expected_score(algorithm, x, log_q))(log_p)
+    np.testing.assert_allclose(found, slopes, atol=1e-6)
+
+
+@pytest.mark.parametrize("cap", [None, 1.2])
+@pytest.mark.parametrize("k", [3, 6])
+def test_centered_scores_have_no_mean_under_the_sampler(cap, k):
+    """Of all six words, or of three where the sampler's others are as likely among themselves as the learner's."""
+    rng = np.random.default_rng(0)
+    logits, algorithm = jnp.asarray(rng.normal(size=6), jnp.float32), Paper(score_centering=k, importance_cap=cap)
+    p, q = np.asarray(jax.nn.softmax(logits)), np.zeros(6)
+    q[:k] = rng.dirichlet(np.ones(k)) * (1.0 if k == 6 else 0.8)
+    q[k:] = 0.2 * p[k:] / p[k:].sum()
+    w = np.ones(6) if cap is None else np.minimum(p / q, cap)
+    score_of = jax.jacobian(jax.nn.log_softmax)(logits)
+    subtracted = jax.grad(
+        lambda x: expected_score(algorithm, jax.nn.log_softmax(x)[:k], jnp.log(jnp.asarray(q[:k], jnp.float32)))
+    )(logits)
+    assert np.abs(subtracted).max() > 0.01
+    np.testing.assert_allclose(subtracted, (q * w) @ np.asarray(score_of), atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"surrogate": Surrogate.CISPO}, "surrogate is Surrogate.CISPO: must be Surrogate.TOKEN"),
+        ({"importance_sequence": True}, "importance_sequence is True: must be False"),
+        ({"minibatches": 2}, "minibatches is 2: must be 1 where score_centering is set; change either"),
+        ({"stale": 1}, "stale is 1: must be 0 for score_centering without importance_cap; set a cap"),
+    ],
+)
+def test_what_score_centering_is_not_defined_for_is_named(change, message):
+    check_centering(Paper(score_centering=4, stale=1, importance_cap=2.0))
+    with pytest.raises(ValueError, match=message):
+        check_centering(Paper(score_centering=4, **change))
+
+
+def test_rollouts_without_the_samplers_tokens_are_named():
+    with pytest.raises(ValueError, match=r"score_centering is set, but rollouts lack .*; set rollouts\.url"):
+        expected_score(Paper(score_centering=4), None, None)

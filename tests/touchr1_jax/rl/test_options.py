@@ -276,7 +276,7 @@ def test_the_learner_scores_what_was_sampled_as_the_sampler_did():
     ("change", "message"),
     [
         ({"minibatches": 0}, "minibatches is 0: must be at least 1"),
-        ({"stale": -1}, "stale is -1: must be ≥ 0"),
+        ({"stale": -1}, "stale is -1: must be at least 0"),
         ({"reference_share": 0.0}, "reference_share is 0.0: must lie in 0 < share ≤ 1"),
     ],
 )

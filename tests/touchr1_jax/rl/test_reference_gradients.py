@@ -28,6 +28,9 @@ ALGORITHMS = {
     "grounding without the perturbed branch": Paper(**LOUD, grounding_stop_masked=True),
     "importance of tokens": Paper(**LOUD, importance_cap=1.1),
     "importance of rollouts": Paper(**LOUD, importance_cap=1.1, importance_sequence=True),
+    "rollouts dropped": Paper(**LOUD, mismatch_limit=0.15, importance_cap=1.1),
+    "scores centered": Paper(**LOUD, score_centering=2),
+    "scores centered under weights": Paper(**LOUD, score_centering=2, importance_cap=1.1),
     "KL in the reward": Paper(**LOUD, kl_in_reward=True),
     "anchor": Paper(**LOUD, anchor=0.7),
 }
@@ -56,7 +59,15 @@ def problem(seed: int = 0) -> dict[str, np.ndarray]:
         "advantage": rng.normal(size=(P, G)),
         "weight": np.array([0.7, 0.3]),
         "answer": rng.integers(0, V, (P, T)),
+        **head_of(own + rng.normal(0, 0.5, own.shape)),
     }
+
+
+def head_of(logits: np.ndarray) -> dict[str, np.ndarray]:
+    """The two most likely tokens of a sampler and their log-probabilities, [P, G, T, 2]."""
+    log_q = reference.log_softmax(logits)
+    head = np.argsort(-log_q, -1)[..., :2]
+    return {"head": head, "head_q": np.take_along_axis(log_q, head, -1)}
 
 
 def ours(config: GRPOConfig, fixed: dict[str, np.ndarray], *, first: bool):
@@ -66,13 +77,13 @@ def ours(config: GRPOConfig, fixed: dict[str, np.ndarray], *, first: bool):
 
     def loss(own, perturbed):
         logits = {"own": own, "reference": x["reference"], "perturbed": perturbed}
-        terms = logit_terms(config, tokens, logits)
+        terms = logit_terms(config, tokens, logits, jnp.asarray(fixed["head"], jnp.int32))
         old = jax.lax.stop_gradient(terms.log_prob) if first else x["old"]
         answer = jnp.asarray(fixed["answer"])[..., None]  # scored by the states of each prompt's first rollout
         likelihood = jnp.take_along_axis(jax.nn.log_softmax(own[:, 0]), answer, -1)[..., 0].mean(-1)
         anchor = likelihood if config.algorithm.anchor else None
         arrays = (terms, old, x["sampler"], mask, x["advantage"], x["weight"])
-        return grpo_loss(*arrays, config, answer=anchor)[0]
+        return grpo_loss(*arrays, config, answer=anchor, head=x["head_q"])[0]
 
     value, gradient = jax.jit(jax.value_and_grad(loss, (0, 1)))(x["own"], x["perturbed"])
     return float(value), np.stack(gradient)

@@ -85,10 +85,12 @@ def qwen_policy(
     tactile: TactileViTConfig,
     view_px: tuple[int, int] = (64, 64),
     budget: PixelBudget = PICTURE_BUDGET,
+    *,
+    in_order: bool = False,
 ) -> Policy:
-    """The policy; `view_px` is the height and width of the pictures in its batches."""
+    """The policy; `view_px` is the height and width of the pictures in its batches, `in_order` as in `PolicyConfig`."""
     view = QwenViewConfig(tower_config=config.vision, height_px=view_px[0], width_px=view_px[1], budget=budget)
-    return Policy(PolicyConfig(tactile=tactile, vision=view, decoder=config.decoder))
+    return Policy(PolicyConfig(tactile=tactile, vision=view, decoder=config.decoder, in_order=in_order))
 
 
 def qwen_fns(
