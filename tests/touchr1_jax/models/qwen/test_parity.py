@@ -32,11 +32,11 @@ def params(tmp_path_factory):
     """Parameters of each case, read through the loader once for each distinct checkpoint."""
 
     @functools.cache
-    def read(window_px: int, tied: bool) -> Params:
-        case = next(c for c in CASES.values() if (c.window_px, c.tied) == (window_px, tied))
+    def read(*differs: object) -> Params:
+        case = next(c for c in CASES.values() if (c.window_px, c.tied, c.shape) == differs)
         return tiny.params_of(case, tmp_path_factory.mktemp("checkpoint"))
 
-    return lambda case: read(case.window_px, case.tied)
+    return lambda case: read(case.window_px, case.tied, case.shape)
 
 
 def close(ours: jax.Array, theirs: np.ndarray) -> None:
@@ -57,7 +57,7 @@ def test_logits_are_those_of_the_reference(name, golden, params):
     close(forward(params(CASES[name]), tiny.inputs_of(name)), theirs)
 
 
-@pytest.mark.parametrize("name", ["mixed"])
+@pytest.mark.parametrize("name", ["mixed", "qwen3_mixed_1"])
 def test_cached_answers_are_the_full_forward_pass(name, golden, params):
     """The prompt without its last words, then these words at once, and one by one."""
     case, last = CASES[name], 4
