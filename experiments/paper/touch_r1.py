@@ -6,14 +6,15 @@
 
 DIR holds a released Qwen2.5-VL or dense Qwen3-VL: config, tokenizer, chat template, picture settings and safetensors
 (see `python -m touchr1_jax.models.load DIR`).  A tactile encoder of our own is added to its towers, which are frozen:
-SFT trains the encoder and low-rank adapters on verified answers, GRPO with the published rewards and the counterfactual KL
-trains the same adapters on.  They are never merged: what is scored, continued and written is the released weights with
-adapters beside them, so that no change is lost to the weights' type.  `--lora.targets` names the adapted layers of the
-decoder, `--lora.vision-targets` those of the vision tower, `--lora.rank-stabilised` scales by rsLoRA.  The policy is
-scored on unseen objects and compared with the released model, which sees the picture and no touch, with the same
-training without touch, and with constants; it is evaluated again under each control of touch.  It is written to
-`policies/NAME/SEED` of the run, adapters in PEFT's format, and evaluated again from there; `python -m experiments ask
-RUN/touch_r1/0 INPUT` asks it about new data, `python -m experiments export` merges it into whole weights.
+SFT trains the encoder and low-rank adapters on verified answers, GRPO with the published rewards and the
+counterfactual KL trains the same adapters on.  They are never merged: what is scored, continued and written is the
+released weights with adapters beside them, so that no change is lost to the weights' type.  `--lora.targets` names
+the adapted layers of the decoder, `--lora.vision-targets` those of the vision tower, `--lora.rank-stabilised` scales
+by rsLoRA.  The policy is scored on unseen objects and compared with the released model, which sees the picture and no
+touch, with the same training without touch, and with constants; it is evaluated again under each control of touch.
+It is written to `policies/NAME/SEED` of the run, adapters in PEFT's format, and evaluated again from there; `python
+-m experiments ask RUN/touch_r1/0 INPUT` asks it about new data, `python -m experiments export` merges it into whole
+weights.
 
 `--scale smoke` makes a tiny checkpoint of the released format where none is given, `smoke_qwen3` one of Qwen3-VL's: it
 tries the code, and its figures mean nothing.  With its drawn embeddings, which are frozen, no decoder can give the

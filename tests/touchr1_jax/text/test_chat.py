@@ -107,7 +107,7 @@ def test_time_is_text_before_each_step():
 
 
 def test_prompts_of_qwen3_are_what_its_template_writes():
-    """Each video of the template becomes, as by the released processor, its steps between marks, each after its time."""
+    """Each video of the template becomes, as by the processor, its steps between marks, each after its time."""
     times = timestamps(range(3), 2.0, 2)
     layout = build_chat_layout(
         TOKENIZER, TOUCH_LANGUAGE, tactile_tokens=6, view_tokens=4, system="Be brief.", times=times

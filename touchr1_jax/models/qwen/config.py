@@ -15,6 +15,9 @@ CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
 CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 """Mean and spread of pixels in [0, 1] on CLIP's training data (Radford et al. 2021), per channel."""
 
+ROPE_THETA = 1e4
+"""Base of the vision towers' rotary angles, the same in every released checkpoint and named in none."""
+
 ModelType = Literal["qwen2_5_vl", "qwen3_vl"]
 
 

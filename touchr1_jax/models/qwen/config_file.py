@@ -7,7 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from touchr1_jax.models.decoder_config import DecoderConfig, Qwen3DecoderConfig
-from touchr1_jax.models.qwen.config import COLOURS, CONFIG_FILE, Qwen3VisionConfig, QwenConfig, QwenVisionConfig
+from touchr1_jax.models.qwen.config import (
+    COLOURS,
+    CONFIG_FILE,
+    ROPE_THETA,
+    Qwen3VisionConfig,
+    QwenConfig,
+    QwenVisionConfig,
+)
 
 MODEL_TYPES = tuple(tower.model_type for tower in (QwenVisionConfig, Qwen3VisionConfig))
 
@@ -153,6 +160,8 @@ def _rope(text: _Fields, head_dim: int, interleaved: bool) -> tuple[float, tuple
 def _qwen3_vision(vision: _Fields) -> Qwen3VisionConfig:
     vision.require("hidden_act", "gelu_pytorch_tanh")
     vision.require("in_channels", COLOURS, default=True)
+    if "rope_parameters" in vision.found:  # written by newer libraries alone
+        vision.part("rope_parameters").require("rope_theta", ROPE_THETA, default=True)
     return Qwen3VisionConfig(
         out_size=vision.count("out_hidden_size"),
         depth=vision.count("depth"),

@@ -7,12 +7,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from touchr1_jax.models.layers import GatedMLP, RMSNorm, Rotation, rotate
-from touchr1_jax.models.qwen.config import QwenVisionConfig, TowerConfig
+from touchr1_jax.models.qwen.config import ROPE_THETA, QwenVisionConfig, TowerConfig
 from touchr1_jax.models.qwen.geometry import Geometry, Grid, Groups, geometry
 from touchr1_jax.models.stacked import scan_layers
-
-ROPE_THETA = 1e4
-"""Base of the towers' rotary angles, the same in every released checkpoint and named in none."""
 
 
 class QwenVision(nn.Module):

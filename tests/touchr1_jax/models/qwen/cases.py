@@ -239,6 +239,15 @@ def picture_pixels() -> np.ndarray:
     return np.clip(shade + 40 * (uniform("picture", (75, 60, 3)) - 0.5), 0, 255).astype(np.uint8)
 
 
+SIDE = 16
+"""Rows and columns of the frames of `video`, pixels."""
+
+
+def video(frames: int) -> np.ndarray:
+    """Frames of noise, uint8."""
+    return (256 * uniform(f"video {frames}", (frames, SIDE, SIDE, 3))).astype(np.uint8)
+
+
 def tensor(key: str, shape: tuple[int, ...]) -> np.ndarray:
     """A weight by its key without prefix: about the size of a trained one, so that attention is not uniform."""
     x = 2 * uniform(key, shape) - 1
