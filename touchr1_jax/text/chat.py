@@ -11,6 +11,8 @@ Qwen3-VL, which reads the time of a video's frames as text, each time step has m
 
     <0.2 seconds><|vision_start|> … <|vision_end|><1.2 seconds><|vision_start|> … <|vision_end|>
 
+as its processor wrote it when it was released (transformers 4.57; 5.23 leaves two more marks around them)
+
 Questions are padded on their left, as in `template`, so that all prompts have one length and end where the completion
 starts.  The published template is a Jinja program; its result is written directly, and `check_template` rejects a
 checkpoint with another template.

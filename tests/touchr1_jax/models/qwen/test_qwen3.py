@@ -102,7 +102,7 @@ def batch():
 def test_steps_are_blocks_after_their_time(policy, batch):
     """The time and marks of a step without frames are absent, and both ways to tell which tokens exist agree."""
     fns, layout = policy.fns, policy.layout
-    touch_time = policy.fns.module.token_time(batch.frame_index, batch.frame_mask)[0]
+    touch_time = fns.module.token_time(jnp.asarray(batch.frame_index), jnp.asarray(batch.frame_mask))[0]
     features = jax.eval_shape(lambda p, b: fns.encode(p, b), policy.init(0, batch), batch)
     assert features.view.shape[-1] == 3 * SMALLEST_QWEN3.hidden_size  # and two levels
     one = jax.tree.map(lambda x: np.zeros(x.shape[1:], x.dtype), features).replace(
@@ -123,7 +123,7 @@ def test_steps_are_blocks_after_their_time(policy, batch):
     np.testing.assert_array_equal(again[0, 0, :-1], mask)
     ours = prompt_positions(touch_time, jnp.asarray(mask), fns.slots, fns.module.config.vision.grid)
     pads = np.isin(np.arange(len(mask)), layout.touch)[mask]
-    grid, tokens = policy.fns.module.config.vision.grid, policy.model.tactile.tokens_per_step
+    grid, tokens = fns.module.config.vision.grid, policy.model.tactile.tokens_per_step
     runs, here = [int(layout.view[0]), Block([0], len(layout.view) // grid, grid)], int(layout.view[-1]) + 1
     text = 0
     for pad in pads[here:]:
