@@ -78,7 +78,7 @@ def check_template(directory: Path, model_type: str) -> Path:
 
 
 def timestamps(frames: Sequence[int], rate: float, frames_per_step: int) -> tuple[str, ...]:
-    """What Qwen3-VL's processor writes before each step of a video, the mean time of its first and last frame.
+    """Text of Qwen3-VL's processor before each step of a video, the mean time of its first and last frame.
 
     Args:
       frames: their numbers in the video; a last step that lacks frames repeats the last.

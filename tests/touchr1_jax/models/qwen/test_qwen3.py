@@ -105,10 +105,10 @@ def test_steps_are_blocks_after_their_time(policy, batch):
     touch_time = fns.module.token_time(jnp.asarray(batch.frame_index), jnp.asarray(batch.frame_mask))[0]
     features = jax.eval_shape(lambda p, b: fns.encode(p, b), policy.init(0, batch), batch)
     assert features.view.shape[-1] == 3 * SMALLEST_QWEN3.hidden_size  # and two levels
-    one = jax.tree.map(lambda x: np.zeros(x.shape[1:], x.dtype), features).replace(
+    one = jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), features).replace(
         touch_time=touch_time, stream_mask=jnp.ones(len(SENSORS), bool), view_mask=jnp.array(True)
     )
-    mask = np.asarray(prompt_mask(one, layout.mask[0], fns.slots))
+    mask = np.asarray(prompt_mask(one, jnp.asarray(layout.mask[0]), fns.slots))
     shown = policy.tokenizer.decode(layout.ids[0, mask])
     times = [f"<{t / 2:.1f} seconds>" for t in range(MODEL.frames)]
     assert [shown.count(time) for time in times] == [4, 4, 3, 3]
