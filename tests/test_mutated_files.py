@@ -225,7 +225,9 @@ def files_of_models(folder):
             found,
         ),
         "chat template": (
-            file_of(folder / "checkpoint" / "tokenizer_config.json", lambda path: check_template(path.parent)),
+            file_of(
+                folder / "checkpoint" / "tokenizer_config.json", lambda path: check_template(path.parent, "qwen2_5_vl")
+            ),
             json.dumps({"chat_template": "{% for %}", "model_max_length": 10}).encode(),
             found,
         ),

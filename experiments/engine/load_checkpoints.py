@@ -20,7 +20,7 @@ from experiments.core.progress import ProgressCallback
 from experiments.engine.processes import in_own_process
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.load import peak_memory
-from touchr1_jax.models.qwen.config import RELEASED, QwenConfig, QwenVisionConfig, released
+from touchr1_jax.models.qwen.config import RELEASED, RELEASED_QWEN3, QwenConfig, QwenVisionConfig, released
 from touchr1_jax.models.qwen.names import published, read, sources
 from touchr1_jax.models.qwen.safetensors import read_tensor, write_file
 from touchr1_jax.models.qwen.weights import INDEX, find_tensors, load_params
@@ -50,8 +50,9 @@ SHAPES: Mapping[str, QwenConfig] = {
     "1.5B": _with_released_tower(hidden_size=1536, num_layers=28, num_heads=12, intermediate_size=8960),
     "3B": released("3B"),
     "7B": released("7B"),
+    **RELEASED_QWEN3,
 }
-"""Size of the decoder → shape; 0.5B and 1.5B are decoders of Qwen2.5 with the tower of Qwen2.5-VL."""
+"""Size of the decoder → shape; 0.5B and 1.5B are decoders of Qwen2.5 with the tower of Qwen2.5-VL, as 3B and 7B."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -126,7 +127,7 @@ def shards(config: QwenConfig, shard_bytes: int) -> Iterator[dict[str, tuple[int
         if shard and filled + size > shard_bytes:
             yield shard
             shard, filled = {}, 0
-        shard[published(s.key)] = s.shape
+        shard[published(s.key, config)] = s.shape
         filled += size
     yield shard
 

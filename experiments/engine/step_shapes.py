@@ -1,4 +1,4 @@
-"""Steps of a policy on a Qwen2.5-VL in shapes alone: compiled, and run on drawn weights."""
+"""Steps of a policy on a Qwen-VL in shapes alone: compiled, and run on drawn weights."""
 
 import dataclasses
 import time
@@ -18,6 +18,7 @@ from touchr1_jax.models.lora import LoraConfig, init_adapters
 from touchr1_jax.models.policy import init_policy
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.qwen.config import QwenConfig
+from touchr1_jax.models.qwen.pictures import RELEASED_BUDGETS
 from touchr1_jax.models.qwen.policy import QwenViewConfig, qwen_policy
 from touchr1_jax.models.released_policy import ReleasedModel
 from touchr1_jax.models.stacked import ADAPTERS, layer_by_layer
@@ -137,7 +138,8 @@ def prompt_of(config: QwenConfig, shape: StepShape) -> PromptShape:
 
 def _module(config: QwenConfig, shape: StepShape) -> Any:
     tactile = dataclasses.replace(shape.model.tactile, sensors=len(SENSORS))
-    return qwen_policy(config, tactile, (shape.model.view_px, shape.model.view_px))
+    budget = RELEASED_BUDGETS[config.vision.model_type]
+    return qwen_policy(config, tactile, (shape.model.view_px, shape.model.view_px), budget)
 
 
 def _half(x: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:

@@ -1,6 +1,6 @@
 """Does a training step of a released model fit this machine, and how long does it compile?
 
-    python -m experiments step_weights [--scale smoke] [--size 3B] [--run]
+    python -m experiments step_weights [--scale smoke] [--size 3B|Qwen3-VL-4B|…] [--run]
 
 One step of SFT, end to end through the vision tower, and one of GRPO, both of adapters on frozen weights in bfloat16,
 are compiled at a released shape without weights, and the memory that the compiler reserves is read.  Decoder and vision
@@ -25,6 +25,7 @@ from experiments.core.runner import Experiment
 from experiments.engine.load_checkpoints import SHAPES
 from experiments.engine.processes import in_own_process
 from experiments.engine.step_shapes import StepShape, compiled_step, run_step
+from touchr1_jax.models.qwen.config import QwenVisionConfig
 
 STAGES = ("SFT", "GRPO")
 GB = 1e9
@@ -90,8 +91,9 @@ def measured(config: StepWeightsConfig, stage: str, layers: int) -> dict[str, fl
     model = SHAPES[config.size]
     if layers:
         depth = min(layers, model.vision.depth)
-        full = tuple(i for i in model.vision.full_layers if i < depth) or (0,)
-        vision = dataclasses.replace(model.vision, depth=depth, full_layers=full)
+        of_layers = "full_layers" if isinstance(model.vision, QwenVisionConfig) else "deepstack_layers"
+        named = tuple(i for i in getattr(model.vision, of_layers) if i < depth) or (0,)
+        vision = dataclasses.replace(model.vision, depth=depth, **{of_layers: named})
         decoder = dataclasses.replace(model.decoder, num_layers=layers)
         model = dataclasses.replace(model, decoder=decoder, vision=vision)
     began = time.process_time(), time.perf_counter()

@@ -44,7 +44,9 @@ def memory_bytes(
     step = abstract_grpo(released, prompt, shape, falling_adamw(1.0, 1.0, 1, 1.0), lora=config.lora)
     lines = grpo_bytes(shape, step.state, step.batch, step.frozen, step.base)
     contacts = len(data.parts["grpo"]) + len(data.parts["test"])
-    of_contact = released.decoder.hidden_size * (4 * streams * touch + shape.number * view)
+    of_contact = released.decoder.hidden_size * (
+        4 * streams * touch + shape.number * (1 + released.vision.levels) * view
+    )
     weights = sum(x.nbytes for x in jax.tree.leaves(policy.checkpoint.params))
     return {STEP: counted_peak(lines), WEIGHTS: weights, CONTACTS: contacts * of_contact}
 

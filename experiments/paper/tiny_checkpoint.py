@@ -4,7 +4,8 @@ Its weights are drawn; `teach` trains all weights of the decoder to write answer
 policies, since a released model knows language and nothing of touch.  A prompt names its sensors and shows neither
 touch nor picture, and the levels of an answer are drawn: the form of answers can be learned, the right level cannot.
 
-`chat_template.jinja` is that of Qwen/Qwen2.5-VL-7B-Instruct (Alibaba Cloud, Apache License 2.0), unchanged.
+`chat_template.jinja` is that of Qwen/Qwen2.5-VL-7B-Instruct, `chat_template_qwen3.jinja` that of
+Qwen/Qwen3-VL-4B-Instruct (Alibaba Cloud, Apache License 2.0), both unchanged.
 """
 
 import dataclasses
@@ -21,9 +22,9 @@ from tokenizers import decoders, models, pre_tokenizers, trainers
 
 from experiments.core.context import Context
 from sensors_io.schema import SENSORS
-from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.models.decoder_config import DecoderConfig, Qwen3DecoderConfig
 from touchr1_jax.models.load import TOKENIZER_FILE, load_checkpoint
-from touchr1_jax.models.qwen.config import CONFIG_FILE, QwenConfig, QwenVisionConfig
+from touchr1_jax.models.qwen.config import CONFIG_FILE, AnyVision, Qwen3VisionConfig, QwenConfig, QwenVisionConfig
 from touchr1_jax.models.qwen.model import init_params
 from touchr1_jax.models.qwen.pictures import PREPROCESSOR_FILE
 from touchr1_jax.models.qwen.weights import SINGLE, save_params
@@ -39,6 +40,7 @@ from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
 from touchr1_jax.types import TouchBatch
 
 TEMPLATE = Path(__file__).parent / "chat_template.jinja"
+TEMPLATE_QWEN3 = Path(__file__).parent / "chat_template_qwen3.jinja"
 
 VOCABULARY = 640
 """Words of the tokenizer; the table has more rows, as Qwen's has."""
@@ -58,6 +60,19 @@ SMALLEST = DecoderConfig(
 )
 """0.1 million parameters with a vision tower."""
 
+SMALLEST_QWEN3 = Qwen3DecoderConfig(
+    vocab_size=ROWS,
+    hidden_size=64,
+    num_layers=3,
+    num_heads=4,
+    num_kv_heads=2,
+    head_dim=24,
+    intermediate_size=96,
+    mrope_section=(4, 4, 4),
+    rope_theta=5e6,
+)
+"""The same of Qwen3-VL's kind, with two levels of its vision tower."""
+
 
 VISION_MARKS = {"vision_start": "vision_start", "vision_end": "vision_end", "image": "image_pad", "video": "video_pad"}
 """Token of `QwenConfig` → its name in the vocabulary."""
@@ -68,6 +83,7 @@ DECODER_FIELDS = {
     "num_layers": "num_hidden_layers",
     "num_heads": "num_attention_heads",
     "num_kv_heads": "num_key_value_heads",
+    "head_dim": "head_dim",
     "norm_epsilon": "rms_norm_eps",
     "rope_theta": "rope_theta",
     "tie_embedding": "tie_word_embeddings",
@@ -83,6 +99,9 @@ VISION_FIELDS = {
     "merge": "spatial_merge_size",
     "patch_frames": "temporal_patch_size",
     "window_px": "window_size",
+    "full_layers": "fullatt_block_indexes",
+    "positions": "num_position_embeddings",
+    "deepstack_layers": "deepstack_visual_indexes",
 }
 """Field of our shapes → its name in a published `config.json`."""
 
@@ -93,7 +112,7 @@ def write_tiny(directory: Path, language: Language, system: str = SYSTEM, decode
     Args:
       directory: created if missing.
       language, system: answers and text that the tokenizer is trained on, so that they are short.
-      decoder: shape of the decoder; its vocabulary is `ROWS`.
+      decoder: shape of the decoder, which says which model it is; its vocabulary is `ROWS`.
     """
     directory.mkdir(parents=True, exist_ok=True)
     library = trained_tokenizer(language, system)
@@ -107,9 +126,12 @@ def write_tiny(directory: Path, language: Language, system: str = SYSTEM, decode
         "patch_size": vision.patch_px,
         "temporal_patch_size": vision.patch_frames,
         "merge_size": vision.merge,
+        "image_mean": vision.pixel_mean,
+        "image_std": vision.pixel_std,
     }
     (directory / PREPROCESSOR_FILE).write_text(json.dumps(pictures), encoding="utf-8")
-    shutil.copy(TEMPLATE, directory)
+    template = TEMPLATE if isinstance(vision, QwenVisionConfig) else TEMPLATE_QWEN3
+    shutil.copy(template, directory / TEMPLATE.name)
     params = jax.jit(lambda key: init_params(config, key))(jax.random.key(0))
     save_params(directory / SINGLE, jax.tree.map(lambda x: x.astype(jnp.bfloat16), params), config)
 
@@ -132,16 +154,10 @@ def trained_tokenizer(language: Language, system: str) -> tokenizers.Tokenizer:
 def tiny_config(library: tokenizers.Tokenizer, decoder: DecoderConfig = SMALLEST) -> QwenConfig:
     """A decoder and the smallest vision tower; the ids are the tokenizer's."""
     ids = library.get_vocab(with_added_tokens=True)
-    vision = QwenVisionConfig(
-        out_size=decoder.hidden_size,
-        depth=1,
-        hidden_size=32,
-        num_heads=2,
-        intermediate_size=44,
-        patch_px=8,
-        window_px=32,
-        full_layers=(0,),
-    )
+    sizes = {"out_size": decoder.hidden_size, "hidden_size": 32, "num_heads": 2, "intermediate_size": 44, "patch_px": 8}
+    vision: AnyVision = QwenVisionConfig(**sizes, depth=1, window_px=32, full_layers=(0,))
+    if isinstance(decoder, Qwen3DecoderConfig):
+        vision = Qwen3VisionConfig(**sizes, depth=2, positions=16, deepstack_layers=(0, 1))
     marks = {f"{name}_id": ids[f"<|{word}|>"] for name, word in VISION_MARKS.items()}
     return QwenConfig(decoder=decoder, vision=vision, **marks)
 
@@ -149,22 +165,20 @@ def tiny_config(library: tokenizers.Tokenizer, decoder: DecoderConfig = SMALLEST
 def published_config(config: QwenConfig) -> dict[str, Any]:
     """The contents of a `config.json` that `parse_config` reads as `config`."""
     d, v = config.decoder, config.vision
-    return {
-        "architectures": ["Qwen2_5_VLForConditionalGeneration"],
-        "model_type": "qwen2_5_vl",
-        "torch_dtype": "bfloat16",
+    older = isinstance(v, QwenVisionConfig)
+    text = {
         "hidden_act": "silu",
-        "rope_scaling": {"type": "mrope", "mrope_section": list(d.mrope_section)},
-        "use_sliding_window": False,
+        "rope_scaling": {"type": "mrope" if older else "default", "mrope_section": list(d.mrope_section)},
         **{published: getattr(d, ours) for ours, published in DECODER_FIELDS.items()},
+    }
+    tower = {published: getattr(v, ours) for ours, published in VISION_FIELDS.items() if hasattr(v, ours)}
+    return {
+        "architectures": [f"Qwen{'2_5_' if older else '3'}VLForConditionalGeneration"],
+        "model_type": v.model_type,
+        "torch_dtype": "bfloat16",
+        **(text if older else {"text_config": text, "tie_word_embeddings": d.tie_embedding}),
         **{f"{name}_token_id": getattr(config, f"{name}_id") for name in VISION_MARKS},
-        "vision_config": {
-            "hidden_act": "silu",
-            "in_chans": 3,
-            "fullatt_block_indexes": list(v.full_layers),
-            "tokens_per_second": 2,
-            **{published: getattr(v, ours) for ours, published in VISION_FIELDS.items()},
-        },
+        "vision_config": {"hidden_act": "silu" if older else "gelu_pytorch_tanh", **tower},
     }
 
 

@@ -1,24 +1,26 @@
-"""What does the paper's training gain on released Qwen2.5-VL weights, and how much of it comes from touch?
+"""What does the paper's training gain on released Qwen-VL weights, and how much of it comes from touch?
 
     make experiment EXP=touch_r1 ARGS="--weights DIR"
     make experiment EXP=touch_r1 ARGS="--weights DIR --data records --data-dir RECORDS"
-    make experiment EXP=touch_r1 ARGS="--scale small|smoke"
+    make experiment EXP=touch_r1 ARGS="--scale small|smoke|smoke_qwen3"
 
-DIR holds a released Qwen2.5-VL: config, tokenizer, chat template, picture settings and safetensors (see
-`python -m touchr1_jax.models.load DIR`).  A tactile encoder of our own is added to its towers, which are frozen: SFT
-trains the encoder and low-rank adapters on verified answers, GRPO with the published rewards and the counterfactual KL
-trains the same adapters on.  They are never merged: what is scored, continued and written is the released weights with
-adapters beside them, so that no change is lost to the weights' type.  `--lora.targets` names the adapted layers of the
-decoder, `--lora.vision-targets` those of the vision tower, `--lora.rank-stabilised` scales by rsLoRA.  The policy is
-scored on unseen objects and compared with the released model, which sees the picture and no touch, with the same
-training without touch, and with constants; it is evaluated again under each control of touch.  It is written to
-`policies/NAME/SEED` of the run, adapters in PEFT's format, and evaluated again from there; `python -m experiments ask
-RUN/touch_r1/0 INPUT` asks it about new data, `python -m experiments export` merges it into whole weights.
+DIR holds a released Qwen2.5-VL or dense Qwen3-VL: config, tokenizer, chat template, picture settings and safetensors
+(see `python -m touchr1_jax.models.load DIR`).  A tactile encoder of our own is added to its towers, which are frozen:
+SFT trains the encoder and low-rank adapters on verified answers, GRPO with the published rewards and the
+counterfactual KL trains the same adapters on.  They are never merged: what is scored, continued and written is the
+released weights with adapters beside them, so that no change is lost to the weights' type.  `--lora.targets` names
+the adapted layers of the decoder, `--lora.vision-targets` those of the vision tower, `--lora.rank-stabilised` scales
+by rsLoRA.  The policy is scored on unseen objects and compared with the released model, which sees the picture and no
+touch, with the same training without touch, and with constants; it is evaluated again under each control of touch.
+It is written to `policies/NAME/SEED` of the run, adapters in PEFT's format, and evaluated again from there; `python
+-m experiments ask RUN/touch_r1/0 INPUT` asks it about new data, `python -m experiments export` merges it into whole
+weights.
 
-`--scale smoke` makes a tiny checkpoint of the released format where none is given: it tries the code, and its figures
-mean nothing.  With its drawn embeddings, which are frozen, no decoder can give the right token a probability above
-0.8 %: greedy answers parse, and GRPO samples noise.  `--scale small` first teaches such a checkpoint to write answers,
-without touch or pictures, and then trains it: without released weights one can watch the training learn.
+`--scale smoke` makes a tiny checkpoint of the released format where none is given, `smoke_qwen3` one of Qwen3-VL's: it
+tries the code, and its figures mean nothing.  With its drawn embeddings, which are frozen, no decoder can give the
+right token a probability above 0.8 %: greedy answers parse, and GRPO samples noise.  `--scale small` first teaches such
+a checkpoint to write answers, without touch or pictures, and then trains it: without released weights one can watch the
+training learn.
 
 `--rollouts.url http://HOST:8000` lets a vLLM server of the same weights draw the rollouts of GRPO (README of
 `touchr1_jax`); prompts' tokens are then numbered one by one, in all stages, as such a server does.
@@ -52,7 +54,7 @@ from experiments.core.runner import Experiment
 from experiments.core.text import interval
 from experiments.paper import released_policy as released
 from experiments.paper.presets import CURVES
-from experiments.paper.tiny_checkpoint import SMALLEST, teach, write_tiny
+from experiments.paper.tiny_checkpoint import SMALLEST, SMALLEST_QWEN3, teach, write_tiny
 from experiments.paper.touch_gain import (
     TouchGain,
     control_answers,
@@ -133,7 +135,7 @@ class TouchR1Config(TrainingConfig):
     """
 
     weights: Path | None = None
-    """Folder of a released Qwen2.5-VL."""
+    """Folder of a released Qwen2.5-VL or Qwen3-VL."""
     tiny: bool = False
     """Make a tiny checkpoint of that format where no weights are given, to try the code."""
     tiny_decoder: DecoderConfig = SMALLEST
@@ -254,8 +256,9 @@ def released_folder(config: TouchR1Config, context: Context) -> Path:
         return config.weights
     if not config.tiny:
         raise WeightsError(
-            "weights is None: must be the folder of a released Qwen2.5-VL (config, tokenizer, chat template, picture "
-            "settings, safetensors); pass --weights DIR, or --scale smoke to try the code on a tiny one"
+            "weights is None: must be the folder of a released Qwen2.5-VL or Qwen3-VL (config, tokenizer, chat "
+            "template, picture settings, safetensors); pass --weights DIR, or --scale smoke to try the code on a tiny "
+            "one"
         )
     made = context.directory / "tiny"
 
@@ -357,7 +360,7 @@ those of GRPO are not tuned."""
 EXPERIMENT = Experiment(
     name="touch_r1",
     config=DEFAULT,
-    scales={"smoke": SMOKE, "small": SMALL},
+    scales={"smoke": SMOKE, "smoke_qwen3": dataclasses.replace(SMOKE, tiny_decoder=SMALLEST_QWEN3), "small": SMALL},
     run=run,
     curves=CURVES,
     quick=("smoke",),

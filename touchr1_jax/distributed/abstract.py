@@ -1,4 +1,4 @@
-"""A GRPO step of a Qwen2.5-VL policy in shapes alone, compiled without weights or data."""
+"""A GRPO step of a Qwen-VL policy in shapes alone, compiled without weights or data."""
 
 import dataclasses
 import functools
@@ -72,7 +72,7 @@ def abstract_grpo(
     attributes: int = 4,
     draws: int = 64,
 ) -> AbstractStep:
-    """The decoder of a Qwen2.5-VL policy on encoded prompts.
+    """The decoder of a Qwen-VL policy on encoded prompts.
 
     Args:
       config: towers; the decoder alone is trained.
@@ -91,7 +91,7 @@ def abstract_grpo(
         touch=of((p, s, n, d), kind),
         touch_time=of((p, s, n), jnp.int32),
         stream_mask=of((p, s), bool),
-        view=of((p, nv, d), kind),
+        view=of((p, nv, (1 + config.vision.levels) * d), kind),
         view_mask=of((p,), bool),
     )
     flags, numbers = of((p, attributes), bool), of((p, attributes), jnp.int32)

@@ -45,8 +45,8 @@ KERNELS: dict[str, Kernel] = {
     **dict.fromkeys(("o_proj", "down"), CLOSING),
     **dict.fromkeys(("qkv", "kv"), JOINED),
     **dict.fromkeys(("proj", "out"), UNJOINED),
-    **dict.fromkeys(("tactile_in", "merge_in", "merger_in", "force_in"), OPENING),
-    **dict.fromkeys(("tactile_out", "merge_out", "merger_out", "force_out"), CLOSING),
+    **dict.fromkeys(("tactile_in", "merge_in", "merger_in", "force_in", "linear_fc1"), OPENING),
+    **dict.fromkeys(("tactile_out", "merge_out", "merger_out", "force_out", "linear_fc2"), CLOSING),
     **dict.fromkeys(("patch", "stem", "energy", "time", "latent", "pixels", "patches", "told"), ENTRY),
 }
 """Dense layers by name, a number at its end left out."""
@@ -55,6 +55,7 @@ LEAVES: dict[str, tuple[Axis, ...]] = {
     "scale": (None,),
     "embedding": (TENSOR, FSDP),
     "patch_embed": ENTRY,
+    "patch_bias": (None,),
     "patch_position": (None, FSDP),
     "position": (None, FSDP),
     "query": (None, None),
@@ -160,8 +161,8 @@ def rule(path: str, rank: int) -> tuple[Axis, ...]:
 def _rule(layer: str, leaf: str) -> tuple[Axis, ...] | None:
     if layer == "conv":
         return {"kernel": CONVOLUTION, "bias": (None,)}.get(leaf)
-    if leaf in LEAVES:
-        return LEAVES[leaf]
+    if leaf in LEAVES or (layer.startswith("norm") and leaf == "bias"):
+        return LEAVES.get(leaf, (None,))
     if layer not in KERNELS:
         return None
     inputs, outputs = KERNELS[layer]

@@ -88,7 +88,9 @@ class Rotation(NamedTuple):
     sin: Float[Array, "T half"]
 
 
-def mrope(positions: Int[Array, "3 T"], head_dim: int, sections: Sequence[int], theta: float) -> Rotation:
+def mrope(
+    positions: Int[Array, "3 T"], head_dim: int, sections: Sequence[int], theta: float, *, interleaved: bool = False
+) -> Rotation:
     """Multimodal rotary angles, position[axis(j)] · θ^(−2j/d) for frequency j (Qwen2-VL, arXiv 2409.12191, §2.1).
 
     Args:
@@ -96,6 +98,8 @@ def mrope(positions: Int[Array, "3 T"], head_dim: int, sections: Sequence[int], 
       head_dim: width d of one attention head.
       sections: how many of the d/2 frequencies follow time, row and column, in this order.
       theta: base of the frequencies.
+      interleaved: the axes take turns, time, row, column, time, …, until the shorter sections are used up, and time has
+        the rest (Qwen3-VL, arXiv 2511.21631, §2.1).
 
     Raises:
       ValueError: when the sections do not fill half a head.
@@ -103,6 +107,10 @@ def mrope(positions: Int[Array, "3 T"], head_dim: int, sections: Sequence[int], 
     if sum(sections) != head_dim // 2 or len(sections) != 3:
         raise ValueError(f"mrope sections {tuple(sections)} must be three that sum to head_dim/2 = {head_dim // 2}")
     axis = np.repeat(np.arange(3), sections)
+    if interleaved:
+        axis = np.zeros(head_dim // 2, int)
+        for i in (1, 2):
+            axis[i : 3 * sections[i] : 3] = i
     frequency = theta ** (-np.arange(0, head_dim, 2, dtype=np.float64) / head_dim)
     angle = positions.astype(jnp.float32)[axis].T * jnp.asarray(frequency, jnp.float32)
     return Rotation(jnp.cos(angle), jnp.sin(angle))

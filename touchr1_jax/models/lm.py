@@ -1,11 +1,10 @@
-"""Decoder language model of the Qwen2.5 shape: grouped-query attention, RMSNorm, SwiGLU, multimodal rotary positions.
+"""Decoder language model of Qwen2.5 and Qwen3: grouped-query attention, RMSNorm, SwiGLU, multimodal rotary positions.
 
 Every method works on one sequence, the learner's `extend` also on a group; the callers batch by `vmap`.  A group of G
 rollouts shares one prompt, so the keys of the prompt (`PrefixCache`) are an argument of their own, which a group, or
 `vmap` over it, leaves as it is.
 """
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -16,48 +15,11 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.models.blocked_attention import LayerCache, Segments, attend_causally, attend_in_segments
-from touchr1_jax.models.layers import (
-    MASKED,
-    GatedMLP,
-    KeySource,
-    RMSNorm,
-    Rotation,
-    SizeError,
-    attend,
-    check_layers,
-    check_sizes,
-    mrope,
-    rotate,
-)
+from touchr1_jax.models.decoder_config import DecoderConfig
+from touchr1_jax.models.deepstack import Levels, add_level
+from touchr1_jax.models.layers import MASKED, GatedMLP, KeySource, RMSNorm, Rotation, attend, mrope, rotate
 from touchr1_jax.models.stacked import scan_layers
 from touchr1_jax.models.vmappable_dense import Dense, Embed, product_with_weights
-from touchr1_jax.validation import above
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class DecoderConfig:
-    """Shape of the decoder; the defaults are the CPU-scale policy, the names are Qwen2.5's."""
-
-    vocab_size: int
-    hidden_size: int = 96
-    num_layers: int = 2
-    num_heads: int = 3
-    num_kv_heads: int = 1
-    head_dim: int = 32
-    intermediate_size: int = 192
-    mrope_section: tuple[int, int, int] = (4, 6, 6)
-    rope_theta: float = 1e4
-    norm_epsilon: float = 1e-6
-    tie_embedding: bool = True
-
-    def __post_init__(self) -> None:
-        check_sizes(self, "hidden_size", "num_heads", "num_kv_heads", "head_dim", "intermediate_size")
-        check_layers(self, least=1)
-        if self.num_heads % self.num_kv_heads:
-            raise SizeError(
-                f"num_heads is {self.num_heads}: must be a multiple of num_kv_heads {self.num_kv_heads}; change either"
-            )
-        above(self, 0, "rope_theta", "norm_epsilon")
 
 
 class Caches(NamedTuple):
@@ -89,9 +51,11 @@ class DecoderLayer(nn.Module):
     def setup(self) -> None:
         c = self.config
         self.norm_attention, self.norm_mlp = RMSNorm(c.norm_epsilon), RMSNorm(c.norm_epsilon)
-        self.q_proj = Dense(c.num_heads * c.head_dim)
-        self.k_proj = Dense(c.num_kv_heads * c.head_dim)
-        self.v_proj = Dense(c.num_kv_heads * c.head_dim)
+        self.q_proj = Dense(c.num_heads * c.head_dim, use_bias=c.qkv_bias)
+        self.k_proj = Dense(c.num_kv_heads * c.head_dim, use_bias=c.qkv_bias)
+        self.v_proj = Dense(c.num_kv_heads * c.head_dim, use_bias=c.qkv_bias)
+        if c.qk_norm:
+            self.q_norm, self.k_norm = RMSNorm(c.norm_epsilon), RMSNorm(c.norm_epsilon)
         self.o_proj = Dense(c.hidden_size, use_bias=False)
         self.mlp = GatedMLP(c.intermediate_size)
 
@@ -99,8 +63,10 @@ class DecoderLayer(nn.Module):
         """Queries of each token, and its keys and values head-major."""
         c, y = self.config, self.norm_attention(x)
         heads = lambda z: z.reshape(*z.shape[:-1], -1, c.head_dim)
-        q = rotate(heads(self.q_proj(y)), rotation)
-        k, v = rotate(heads(self.k_proj(y)), rotation), heads(self.v_proj(y))
+        q, k, v = heads(self.q_proj(y)), heads(self.k_proj(y)), heads(self.v_proj(y))
+        if c.qk_norm:
+            q, k = self.q_norm(q), self.k_norm(k)
+        q, k = rotate(q, rotation), rotate(k, rotation)
         major = lambda z: jnp.moveaxis(z, -2, 0)
         return q.reshape(*x.shape[:-1], c.num_kv_heads, -1, c.head_dim), LayerCache(major(k), major(v))
 
@@ -204,6 +170,7 @@ class Decoder(nn.Module):
         mask: Bool[Array, "L"],
         known: PrefixCache | None = None,
         start: int = 0,
+        levels: Levels = None,
     ) -> tuple[Float[Array, "D"], PrefixCache]:
         """Encode a prompt once.
 
@@ -213,6 +180,7 @@ class Decoder(nn.Module):
           mask: which tokens exist; the others are never attended to.
           known: an earlier encoding of a prompt that is the same before `start`, whose keys are taken over.
           start: first token that is computed.
+          levels: added to the tokens after each of the first layers, which the last is not among.
 
         Returns:
           The hidden state of the last token and the cache that `extend` and `decode` read.
@@ -221,18 +189,18 @@ class Decoder(nn.Module):
         old: Any = Caches(None, None) if known is None else known.caches  # type: ignore[arg-type]
         before = jax.tree.map(lambda rows: rows[..., :start, :], old)
         each = lambda layer, y, rows: layer.over_prompt(y, rotation, mask, rows)
-        x, layers = self._scan(each, x, before.layers)
+        x, layers = self._scan(each, x, before.layers, levels=None if levels is None else levels[:, start:])
         # the completion needs all keys of the last layer, but only the last token's answer
         x, last = self.last_layer.over_end(x, rotation, mask, before.last)
         return x[0], PrefixCache(Caches(layers, last), mask, _after(positions, mask))
 
     def states(
-        self, x: Float[Array, "L D"], positions: Int[Array, "3 L"], mask: Bool[Array, "L"]
+        self, x: Float[Array, "L D"], positions: Int[Array, "3 L"], mask: Bool[Array, "L"], levels: Levels = None
     ) -> tuple[Float[Array, "L D"], PrefixCache]:
         """As `prefill`, with the hidden states of all tokens."""
         rotation = self._rotation(positions)
         each = lambda layer, y: layer.over_prompt(y, rotation, mask)
-        x, layers = self._scan(each, x)
+        x, layers = self._scan(each, x, levels=levels)
         x, last = each(self.last_layer, x)
         return x, PrefixCache(Caches(layers, last), mask, _after(positions, mask))
 
@@ -256,6 +224,7 @@ class Decoder(nn.Module):
         positions: Int[Array, "3 W"],
         segments: Segments,
         places: Int[Array, "K"],
+        levels: Levels = None,
     ) -> Float[Array, "K D"]:
         """Hidden states at some places of a row of examples, each of which sees what precedes it in its own alone.
 
@@ -264,9 +233,10 @@ class Decoder(nn.Module):
           positions: (time, row, column) of each token.
           segments: the example of each token.
           places: whose states are wanted.
+          levels: as in `prefill`.
         """
         rotation = self._rotation(positions)
-        x, _ = self._scan(lambda layer, y: (layer.over_row(y, rotation, segments), None), x)
+        x, _ = self._scan(lambda layer, y: (layer.over_row(y, rotation, segments), None), x, levels=levels)
         return self.last_layer.over_places(x, rotation, segments, places)
 
     def decode(
@@ -307,11 +277,21 @@ class Decoder(nn.Module):
         mask = seen & (jnp.arange(rows) <= t + jnp.arange(n)[:, None])
         return *self._append(x, rotation, t, prefix, caches, mask), seen
 
-    def _scan(self, each: Callable[..., tuple[Any, Any]], x: Any, *of_layers: Any) -> tuple[Any, Any]:
+    def _scan(
+        self, each: Callable[..., tuple[Any, Any]], x: Any, *of_layers: Any, levels: Levels = None
+    ) -> tuple[Any, Any]:
         """x through all layers before the last, each(layer, x, its part of `of_layers`) → x, what is kept of it."""
-        if self.config.num_layers == 1:
+        count = self.config.num_layers - 1
+        if not count:
             return x, None
-        return scan_layers(each, self.config.num_layers - 1)(self.layers, x, *of_layers)
+        if levels is None:
+            return scan_layers(each, count)(self.layers, x, *of_layers)
+
+        def with_level(layer: DecoderLayer, y: Array, i: Int[Array, ""], *of_layer: Any) -> tuple[Array, Any]:
+            y, kept = each(layer, y, *of_layer)
+            return add_level(y, levels, i), kept
+
+        return scan_layers(with_level, count)(self.layers, x, jnp.arange(count), *of_layers)
 
     def _after_prefix(
         self, x: Float[Array, "*g T D"], rotation: Rotation, prefix: PrefixCache, exists: Bool[Array, "T"] | None = None
@@ -353,7 +333,7 @@ class Decoder(nn.Module):
 
     def _rotation(self, positions: Int[Array, "3 T"]) -> Rotation:
         c = self.config
-        return mrope(positions, c.head_dim, c.mrope_section, c.rope_theta)
+        return mrope(positions, c.head_dim, c.mrope_section, c.rope_theta, interleaved=c.interleaved)
 
 
 def _joined(before: LayerCache | None, own: LayerCache) -> LayerCache:

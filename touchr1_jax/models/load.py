@@ -1,4 +1,4 @@
-"""Read a released Qwen2.5-VL: config, weights, tokenizer and chat template of one directory.
+"""Read a released Qwen2.5-VL or Qwen3-VL: config, weights, tokenizer and chat template of one directory.
 
     python -m touchr1_jax.models.load DIR [--dtype bfloat16|float32]
 
@@ -22,7 +22,8 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 
-from touchr1_jax.models.qwen.config import QwenConfig, read_config
+from touchr1_jax.models.qwen.config import QwenConfig, QwenVisionConfig
+from touchr1_jax.models.qwen.config_file import read_config
 from touchr1_jax.models.qwen.pictures import PixelBudget, read_budget
 from touchr1_jax.models.qwen.safetensors import ReportBytes
 from touchr1_jax.models.qwen.weights import load_params
@@ -75,7 +76,7 @@ def _read(directory: Path, dtype: jnp.dtype | type, progress: ReportBytes) -> Ch
     config = read_config(directory)
     tokenizer = from_file(directory / TOKENIZER_FILE, vocab_size=config.decoder.vocab_size)
     check_ids(tokenizer, config)
-    check_template(directory)
+    check_template(directory, config.vision.model_type)
     budget = read_budget(directory, config.vision)
     params = load_params(directory, config, dtype, progress=progress)
     return Checkpoint(config=config, params=params, tokenizer=tokenizer, budget=budget, directory=directory)
@@ -138,10 +139,14 @@ class Load:
         leaves = jax.tree.leaves(found.params)
         size, peak = sum(x.nbytes for x in leaves), peak_memory()
         d, v = found.config.decoder, found.config.vision
+        if isinstance(v, QwenVisionConfig):
+            special = f"windows of {v.window_px} px, none in {v.full_layers}"
+        else:
+            special = f"those of {v.deepstack_layers} also read by the decoder"
         console.print(
             f"decoder  {d.num_layers} layers of {d.hidden_size}, {d.num_heads} heads over {d.num_kv_heads}, "
             f"{d.vocab_size} tokens, head {'tied' if d.tie_embedding else 'untied'}\n"
-            f"vision   {v.depth} layers of {v.hidden_size}, windows of {v.window_px} px, none in {v.full_layers}\n"
+            f"vision   {v.depth} layers of {v.hidden_size}, {special}\n"
             f"weights  {sum(math.prod(x.shape) for x in leaves):,} parameters, {size / 1e9:.2f} GB {self.dtype}, "
             f"read in {time.perf_counter() - began:.1f} s\n"
             f"memory   {peak / 1e9:.2f} GB at most, {peak / size:.2f} × the weights"

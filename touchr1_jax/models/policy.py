@@ -20,6 +20,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.models.blocked_attention import Segments
+from touchr1_jax.models.deepstack import Levels, placed, split_levels
 from touchr1_jax.models.layers import RMSNorm
 from touchr1_jax.models.lm import CompletionCaches, Decoder, DecoderConfig, PrefixCache
 from touchr1_jax.models.tactile_vit import TactileViTConfig
@@ -28,7 +29,8 @@ from touchr1_jax.types import Params, TouchBatch
 
 @struct.dataclass
 class Features:
-    """Decoder input of one contact: tactile tokens with their frame indices, and view tokens.
+    """Decoder input of one contact: tactile tokens with their frame indices, and view tokens, with their levels if the
+    vision tower has any (`models.deepstack`).
 
     `touch_time` is the integer frame index of each tactile token, never seconds: a cast of seconds per step to integers
     would zero it and make a temporal control vacuous.  It is −1 where a time step has no frame: no such token exists.
@@ -37,16 +39,20 @@ class Features:
     touch: Float[Array, "*n S N D"]
     touch_time: Int[Array, "*n S N"]
     stream_mask: Bool[Array, "*n S"]
-    view: Float[Array, "*n Nv D"]
+    view: Float[Array, "*n Nv E"]
     view_mask: Bool[Array, "*n"]
 
 
 class Slots(NamedTuple):
-    """Where a prompt keeps its embedded tokens: positions on the L axis, as static NumPy integers."""
+    """Where a prompt keeps its embedded tokens: positions on the L axis, as static NumPy integers.
+
+    With `step_text` words say the time of each time step, and its tokens have no time of their own.
+    """
 
     touch: np.ndarray  # [S, N]
     view: np.ndarray  # [Nv]
     stream_text: np.ndarray  # [L]: stream whose text a token is, S for the view's marks, −1 for other tokens
+    step_text: np.ndarray | None = None  # [L]: a tactile token of the step whose text a token is, −1 for other tokens
 
 
 class Row(NamedTuple):
@@ -168,10 +174,10 @@ class Policy(nn.Module):
         start: int = 0,
     ) -> tuple[Float[Array, "D"], PrefixCache]:
         """As `prefill`, but the hidden state that the first token's logits are made of."""
-        x = with_features(self.decoder.embed(ids), features, slots)
+        x, levels = with_features(self.decoder.embed(ids), features, slots)
         mask = prompt_mask(features, mask, slots)
         positions = prompt_positions(features.touch_time, mask, slots, self.config.grid)
-        return self.decoder.prefill(x, positions, mask, known, start)
+        return self.decoder.prefill(x, positions, mask, known, start, levels)
 
     def completion_states(
         self, tokens: Int[Array, "*g T"], first: Float[Array, "D"], prefix: PrefixCache
@@ -208,12 +214,14 @@ class Policy(nn.Module):
         before = jnp.pad(latest, (1, touch.shape[1] - 1)).reshape(turns, -1)[:, :width]
         return jnp.concatenate([first[None], hidden])[before.reshape(-1)]
 
-    def packed_states(self, features: Float[Array, "n D"], row: Row) -> Float[Array, "K D"]:
+    def packed_states(self, features: Float[Array, "n E"], row: Row) -> Float[Array, "K D"]:
         """Hidden states at the places of a row that ask for them; `features` as in `Row`."""
         x = self.decoder.embed(row.ids)
-        seen = features[jnp.maximum(row.feature, 0)].astype(x.dtype)
-        x = jnp.where((row.feature >= 0)[:, None], seen, x)
-        return self.decoder.packed_states(x, row.positions, row.segments, row.places)
+        embedded = (row.feature >= 0)[:, None]
+        seen, levels = split_levels(features[jnp.maximum(row.feature, 0)].astype(x.dtype), x.shape[-1])
+        levels = None if levels is None else jnp.where(embedded, levels, 0)
+        x = jnp.where(embedded, seen, x)
+        return self.decoder.packed_states(x, row.positions, row.segments, row.places, levels)
 
     def logits(self, states: Float[Array, "*n D"], banned: Bool[Array, "V"]) -> Float[Array, "*n V"]:
         """Scores of the token that each hidden state predicts."""
@@ -253,9 +261,11 @@ def init_policy(
     return init(key, jax.tree.map(lambda x: x[:1], batch))["params"]
 
 
-def with_features(x: Float[Array, "L D"], features: Features, slots: Slots) -> Float[Array, "L D"]:
-    """Embedded words of a prompt, with tactile and view tokens in their places."""
-    return x.at[slots.touch].set(features.touch.astype(x.dtype)).at[slots.view].set(features.view.astype(x.dtype))
+def with_features(x: Float[Array, "L D"], features: Features, slots: Slots) -> tuple[Float[Array, "L D"], Levels]:
+    """Embedded words of a prompt, with tactile and view tokens in their places, and the levels of all tokens."""
+    view, levels = split_levels(features.view.astype(x.dtype), x.shape[-1])
+    x = x.at[slots.touch].set(features.touch.astype(x.dtype)).at[slots.view].set(view)
+    return x, placed(levels, slots.view, len(x))
 
 
 def prompt_mask(features: Features, mask: Bool[Array, "L"], slots: Slots) -> Bool[Array, "L"]:
@@ -264,7 +274,9 @@ def prompt_mask(features: Features, mask: Bool[Array, "L"], slots: Slots) -> Boo
     mask = jnp.asarray(mask).at[slots.touch].set(felt)
     mask = mask.at[slots.view].set(features.view_mask)
     named = jnp.append(features.stream_mask, features.view_mask)[np.maximum(slots.stream_text, 0)]
-    return mask & jnp.where(slots.stream_text >= 0, named, True)
+    mask = mask & jnp.where(slots.stream_text >= 0, named, True)
+    step = slots.step_text
+    return mask if step is None else mask & jnp.where(step >= 0, mask[np.maximum(step, 0)], True)
 
 
 def prompt_positions(
@@ -273,14 +285,17 @@ def prompt_positions(
     """(time, row, column) id of each prompt token, block by block as Qwen2.5-VL counts them.
 
     A text token advances all three by one.  A view token keeps the time of its block and adds its row and column.  A
-    tactile token adds its frame index to the time of its block and its number within the step to the column.  A block
-    starts after the largest id before it, and tokens that do not exist advance nothing, so padding changes no position.
-    Without a grid all tokens count as text.
+    tactile token adds its frame index to the time of its block and its number within the step to the column; where text
+    says the time, each step is a block and adds none, as Qwen3-VL counts the frames of a video.  A block starts after
+    the largest id before it, and tokens that do not exist advance nothing, so padding changes no position.  Without a
+    grid all tokens count as text.
     """
     owner = np.full(mask.shape[0], -1)
     if grid is not None:
         owner[slots.view] = 0
         owner[slots.touch] = 1 + np.arange(len(slots.touch))[:, None]
+    number = np.zeros(mask.shape[0], int)
+    number[slots.touch] = np.arange(slots.touch.shape[1])
     starts = np.flatnonzero(np.diff(owner, prepend=-2))
     base, blocks = jnp.zeros((), jnp.int32), []
     for begin, end in zip(starts, [*starts[1:], len(owner)], strict=True):
@@ -292,7 +307,8 @@ def prompt_positions(
             cell = np.arange(end - begin)
             local = jnp.stack([jnp.zeros_like(cell), cell // (grid or 1), cell % (grid or 1)])
         else:
-            time = touch_time[owner[begin] - 1]
+            time = touch_time[owner[begin] - 1, number[begin:end]]
+            time = time if slots.step_text is None else jnp.zeros_like(time)
             column = np.concatenate([[0], np.cumsum(np.ones(end - begin - 1, int))])
             local = jnp.stack([time, jnp.zeros_like(time), jnp.asarray(column) - _run_start(time)])
         blocks.append(base + local)

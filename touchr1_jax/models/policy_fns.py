@@ -51,7 +51,7 @@ class PolicyFns:
         """The functions of a module on the prompts of a layout."""
         return cls(
             module=module,
-            slots=Slots(layout.touch, layout.view, layout.stream_text),
+            slots=Slots(layout.touch, layout.view, layout.stream_text, layout.step_text),
             banned=tokenizer.banned,
             end_ids=tokenizer.end_ids,
             pad_id=tokenizer.pad_id,
@@ -133,7 +133,7 @@ class PolicyFns:
         first, prefix = self._apply(params, Policy.prefill_state, features, ids, mask, self.slots, known, start)
         return self._apply(params, Policy.completion_states, tokens, first, prefix), prefix
 
-    def packed_states(self, params: Params, features: Float[Array, "n D"], row: Row) -> Float[Array, "K D"]:
+    def packed_states(self, params: Params, features: Float[Array, "n E"], row: Row) -> Float[Array, "K D"]:
         """Hidden states at the places of a row of prompts with their completions, as `group_states` has them."""
         return self._apply(params, Policy.packed_states, features, row)
 

@@ -14,7 +14,7 @@ from touchr1_jax.models.load import Checkpoint
 from touchr1_jax.models.qwen.policy import QwenViewConfig, init_on_pretrained, qwen_fns, qwen_policy
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import TouchConfig, TouchPolicy, language_of
-from touchr1_jax.text.chat import build_chat_layout
+from touchr1_jax.text.chat import FRAMES_PER_SECOND, build_chat_layout, timestamps
 from touchr1_jax.text.language import Language
 from touchr1_jax.text.parser import compile_parser
 from touchr1_jax.text.template import answer_text
@@ -33,7 +33,7 @@ class ReleasedModel(TouchConfig):
     image_px: int = 224
     completion_tokens: int = 96
     view_px: int = 224
-    """Rows and columns of the object's picture; the released vision tower makes one token of 28² pixels."""
+    """Rows and columns of the object's picture; the released vision towers make one token of 28² or 32² pixels."""
     dtype: Literal["bfloat16", "float32"] = "bfloat16"
     in_order: bool = False
     """Number a prompt's tokens one by one, as a server does that draws rollouts from their embeddings alone."""
@@ -103,12 +103,14 @@ def build_released_policy(model: ReleasedModel, found: Checkpoint, sensors: tupl
     policy = qwen_policy(found.config, tactile, view_px, found.budget, in_order=model.in_order)
     view = policy.config.vision
     assert isinstance(view, QwenViewConfig)
+    as_text = found.config.vision.model_type == "qwen3_vl"
     layout = build_chat_layout(
         found.tokenizer,
         language,
         tactile_tokens=model.stream_tokens,
         view_tokens=view.tokens,
         system=instruction(language),
+        times=timestamps(range(model.frames), FRAMES_PER_SECOND, tactile.frames_per_step) if as_text else (),
     )
     return ReleasedPolicy(
         model=model,

@@ -74,7 +74,7 @@ def embedded_prompts(
     """
 
     def one(features: Any, ids: Array, mask: Array) -> tuple[Array, Array]:
-        return with_features(table[ids], features, slots), prompt_mask(features, mask, slots)
+        return with_features(table[ids], features, slots)[0], prompt_mask(features, mask, slots)
 
     return jax.vmap(one)(batch.features, jnp.asarray(batch.ids), jnp.asarray(batch.mask))
 

@@ -1,4 +1,4 @@
-"""The prompt of a policy on a pretrained Qwen2.5-VL, in the chat template that the model was trained on.
+"""The prompt of a policy on a pretrained Qwen-VL, in the chat template that the model was trained on.
 
     <|im_start|>system
     You are a helpful assistant.<|im_end|>
@@ -6,7 +6,13 @@
     <view>, for each sensor its name and its touch, the question<|im_end|>
     <|im_start|>assistant
 
-View and touch stand between the two marks of vision: touch takes the place of a video, one pad per tactile token.
+View and touch stand between the two marks of vision: touch takes the place of a video, one pad per tactile token.  For
+Qwen3-VL, which reads the time of a video's frames as text, each time step has marks of its own, after its time:
+
+    <0.2 seconds><|vision_start|> … <|vision_end|><1.2 seconds><|vision_start|> … <|vision_end|>
+
+as its processor wrote it when it was released (transformers 4.57; 5.23 leaves two more marks around them)
+
 Questions are padded on their left, as in `template`, so that all prompts have one length and end where the completion
 starts.  The published template is a Jinja program; its result is written directly, and `check_template` rejects a
 checkpoint with another template.
@@ -14,6 +20,7 @@ checkpoint with another template.
 
 import hashlib
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -29,13 +36,19 @@ MARKS = (TURN, TURN_END, VISION, VISION_END, "<|image_pad|>", "<|video_pad|>", "
 """Special tokens of the template."""
 
 SYSTEM = "You are a helpful assistant."
-"""System message of the published template where a conversation gives none."""
+"""System message of Qwen2.5-VL's template where a conversation gives none; Qwen3-VL's has none then."""
 
-TEMPLATE_SHA256 = "a0bc6f6fc7a29a80017a433e8f03a1cc1236e838a944a2d034295a60c4f2fddb"
-"""Digest of the published template without surrounding white space, the same for all released sizes."""
+TEMPLATE_SHA256: Mapping[str, str] = {
+    "qwen2_5_vl": "a0bc6f6fc7a29a80017a433e8f03a1cc1236e838a944a2d034295a60c4f2fddb",
+    "qwen3_vl": "9d879ef91075acbfb2df7e441fd79d60bacfca989cf6d511d2af45c681e94f10",
+}
+"""Type of the model → digest of the published template of its Instruct checkpoints, without surrounding white space."""
+
+FRAMES_PER_SECOND = 2.0
+"""Rate at which Qwen3-VL's processor samples videos, and at which the frames of a touch are shown to it."""
 
 
-def check_template(directory: Path) -> Path:
+def check_template(directory: Path, model_type: str) -> Path:
     """Find the chat template of a checkpoint, which must be the published one; return its file.
 
     Raises:
@@ -53,18 +66,38 @@ def check_template(directory: Path) -> Path:
             raise ValueError(f"{path} is no JSON object: {error}; fetch it again") from error
         if not isinstance(template, str):
             continue
+        published = TEMPLATE_SHA256[model_type]
         digest = hashlib.sha256(template.strip().encode()).hexdigest()
-        if digest != TEMPLATE_SHA256:
+        if digest != published:
             raise ValueError(
-                f"{path} holds another chat template (SHA-256 {digest[:12]}…, published {TEMPLATE_SHA256[:12]}…): "
-                "prompts would not be what the model was trained on; use a released Qwen2.5-VL Instruct checkpoint"
+                f"{path} holds another chat template (SHA-256 {digest[:12]}…, published {published[:12]}…): "
+                "prompts would not be what the model was trained on; use a released Qwen-VL Instruct checkpoint"
             )
         return path
     raise FileNotFoundError(f"{directory} has no chat template: fetch chat_template.json or tokenizer_config.json")
 
 
+def timestamps(frames: Sequence[int], rate: float, frames_per_step: int) -> tuple[str, ...]:
+    """Text of Qwen3-VL's processor before each step of a video, the mean time of its first and last frame.
+
+    Args:
+      frames: their numbers in the video; a last step that lacks frames repeats the last.
+      rate: frames per second.
+      frames_per_step: of the vision tower.
+    """
+    times = [i / rate for i in (*frames, *[frames[-1]] * (-len(frames) % frames_per_step))]
+    steps = zip(times[::frames_per_step], times[frames_per_step - 1 :: frames_per_step], strict=True)
+    return tuple(f"<{(first + last) / 2:.1f} seconds>" for first, last in steps)
+
+
 def build_chat_layout(
-    tokenizer: Tokenizer, language: Language, *, tactile_tokens: int, view_tokens: int, system: str = SYSTEM
+    tokenizer: Tokenizer,
+    language: Language,
+    *,
+    tactile_tokens: int,
+    view_tokens: int,
+    system: str = SYSTEM,
+    times: Sequence[str] = (),
 ) -> PromptLayout:
     """Lay out one prompt per attribute of the language, in its order.
 
@@ -77,12 +110,15 @@ def build_chat_layout(
       tactile_tokens: n, embeddings per stream.
       view_tokens: n_view, embeddings of the RGB view; 0 for none.
       system: the system message.
+      times: text before each time step of a stream, which share its tokens equally; none for Qwen2.5-VL.
 
     Raises:
-      ValueError: a tokenizer that splits a mark, or as `question_ids`.
+      ValueError: a tokenizer that splits a mark, time steps that cannot share the tokens, or as `question_ids`.
     """
+    if times and tactile_tokens % len(times):
+        raise ValueError(f"tactile_tokens is {tactile_tokens}: must be a multiple of the {len(times)} times; change it")
     questions = [question_ids(tokenizer, language, (a.name,), QUESTIONS) for a in language.attributes]
-    head, owner, touch, view = _head(tokenizer, language, tactile_tokens, view_tokens, system)
+    head, owner, step, touch, view = _head(tokenizer, language, tactile_tokens, view_tokens, system, times)
     tail = tokenizer.encode(f"{TURN_END}\n{_opening('assistant')}")
     width = max(map(len, questions))
     padding = [width - len(ids) for ids in questions]
@@ -94,31 +130,44 @@ def build_chat_layout(
         touch=np.array(touch, np.int32),
         view=np.array(view, np.int32),
         stream_text=np.array(owner + [-1] * (width + len(tail)), np.int32),
+        step_text=np.array(step + [-1] * (width + len(tail)), np.int32) if times else None,
     )
 
 
 def _head(
-    tokenizer: Tokenizer, language: Language, tactile_tokens: int, view_tokens: int, system: str
-) -> tuple[list[int], list[int], list[list[int]], list[int]]:
-    """Ids before the question, the stream whose text each is, and the places of touch and view."""
+    tokenizer: Tokenizer,
+    language: Language,
+    tactile_tokens: int,
+    view_tokens: int,
+    system: str,
+    times: Sequence[str],
+) -> tuple[list[int], list[int], list[int], list[list[int]], list[int]]:
+    """Ids before the question, the stream and the step whose text each is, and the places of touch and view."""
     begin, end = (_mark(tokenizer, mark) for mark in (VISION, VISION_END))
     ids = tokenizer.encode(f"{_opening('system')}{system}{TURN_END}\n{_opening('user')}")
-    owner = [-1] * len(ids)
+    owner, step = [-1] * len(ids), [-1] * len(ids)
 
-    def show(pad: int, count: int, whose: int) -> list[int]:
-        places = list(range(len(ids) + 1, len(ids) + 1 + count))
-        ids.extend([begin, *[pad] * count, end])
-        owner.extend([whose, *[-1] * count, whose])
-        return places
+    def write(text: list[int], whose: int, at: int = -1) -> None:
+        ids.extend(text)
+        owner.extend([whose] * len(text))
+        step.extend([at] * len(text))
 
-    view = show(tokenizer.view_id, view_tokens, len(language.sensors)) if view_tokens else []
+    def show(before: str, pad: int, count: int, whose: int) -> list[int]:
+        text = [*tokenizer.encode(before), begin]
+        first = len(ids) + len(text)
+        at = first if before else -1
+        write(text, whose, at)
+        write([pad] * count, -1)
+        write([end], whose, at)
+        return list(range(first, first + count))
+
+    view = show("", tokenizer.view_id, view_tokens, len(language.sensors)) if view_tokens else []
     touch = []
     for s, sensor in enumerate(language.sensors):
-        name = tokenizer.encode(sensor.phrases[0])
-        ids.extend(name)
-        owner.extend([s] * len(name))
-        touch.append(show(tokenizer.tactile_id, tactile_tokens, s))
-    return ids, owner, touch, view
+        write(tokenizer.encode(sensor.phrases[0]), s)
+        shown = [show(time, tokenizer.tactile_id, tactile_tokens // len(times or ("",)), s) for time in times or ("",)]
+        touch.append([place for places in shown for place in places])
+    return ids, owner, step, touch, view
 
 
 def _opening(role: Literal["system", "user", "assistant"]) -> str:

@@ -44,6 +44,8 @@ class PromptLayout:
       touch: positions of the n tactile tokens of each stream.
       view: positions of the view tokens.
       stream_text: stream whose name a token belongs to, −1 for all other tokens.
+      step_text: where text says the time of each time step, a tactile token of the step whose text a token is, −1 for
+        all other tokens.
     """
 
     asked: np.ndarray  # bool [Q, A]
@@ -52,6 +54,7 @@ class PromptLayout:
     touch: np.ndarray  # int32 [S, n]
     view: np.ndarray  # int32 [n_view]
     stream_text: np.ndarray  # int32 [L]
+    step_text: np.ndarray | None = None  # int32 [L]
 
 
 def prompt_words() -> tuple[str, ...]:

@@ -89,6 +89,8 @@ def existing_tokens(
     viewed = np.broadcast_to(touch.view_mask[:, None, None], (*felt.shape[:2], 1))
     named = np.concatenate([felt, viewed], -1)[..., np.maximum(slots.stream_text, 0)]
     prompt &= np.where(slots.stream_text >= 0, named, True)
+    if slots.step_text is not None:
+        prompt &= np.where(slots.step_text >= 0, prompt[..., np.maximum(slots.step_text, 0)], True)
     answer = np.logical_or.accumulate(token_mask[..., ::-1], -1)[..., ::-1]
     return np.concatenate([prompt & token_mask.any(-1, keepdims=True), answer], -1)
 

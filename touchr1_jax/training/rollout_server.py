@@ -107,8 +107,8 @@ class RolloutServer:
           devices: where they run.
 
         Raises:
-          ValueError: a policy without adapters in the decoder or with positions that no server has, several devices,
-            or as `check_served`.
+          ValueError: a policy without adapters in the decoder, with positions that no server has or with DeepStack,
+            several devices, or as `check_served`.
           RolloutError: no answer, or none of this protocol.
         """
         check_served(config)
@@ -117,6 +117,9 @@ class RolloutServer:
             raise ValueError(f"lora.targets is {policy.fns.lora.targets}: must name layers of the decoder {needs}")
         if not policy.fns.module.config.in_order:
             raise ValueError(f"model.in_order is False: must be True {needs}; set it")
+        if policy.checkpoint.config.vision.levels:
+            kind = policy.checkpoint.config.vision.model_type
+            raise ValueError(f"weights are of {kind}: must be of qwen2_5_vl {needs}, which takes one embedding a token")
         if devices.shape != (1, 1, 1):
             raise ValueError(f"mesh is {devices.shape}: must be one device {needs}; leave it, or rollouts.url, out")
         answer = self._send(MODELS)

@@ -175,7 +175,7 @@ def _scored(fns: PolicyFns, params: Params, rows: Rows, max_logits: int) -> Rows
 def row_scores(
     fns: PolicyFns,
     params: Params,
-    seen: Float[Array, "n D"],
+    seen: Float[Array, "n E"],
     tokens: Tokens,
     source: Int[Array, "W"],
     predicts: Int[Array, "K"],
@@ -201,10 +201,12 @@ def encoded(fns: PolicyFns, params: Params, batch: SFTBatch, *, blind: bool = Fa
 
 def encoded_group(
     fns: PolicyFns, params: Params, batch: SFTBatch, *, blind: bool = False
-) -> tuple[Float[Array, "P n D"], Features]:
+) -> tuple[Float[Array, "P n E"], Features]:
     """Tokens of each contact's streams and view, one after the other, and the features that they are of."""
     features = encoded(fns, params, batch, blind=blind)
     touch = features.touch.reshape(len(features.touch), -1, features.touch.shape[-1])
+    levels = features.view.shape[-1] - touch.shape[-1]  # of a vision tower with DeepStack; touch has none
+    touch = jnp.pad(touch, [(0, 0), (0, 0), (0, levels)])
     return jnp.concatenate([touch, features.view.astype(touch.dtype)], 1), features
 
 

@@ -20,7 +20,8 @@ from touchr1_jax.models.adapted_folder import export_merged, read_adapted, save_
 from touchr1_jax.models.layers import SizeError
 from touchr1_jax.models.load import Load, WeightsError, load_checkpoint
 from touchr1_jax.models.lora import with_adapters
-from touchr1_jax.models.qwen.config import parse_config, released
+from touchr1_jax.models.qwen.config import released
+from touchr1_jax.models.qwen.config_file import parse_config
 from touchr1_jax.models.released_policy import build_released_policy, instruction, longest_answer, plain_answers
 from touchr1_jax.models.saved_policy import PolicyError, PolicyInput, SavedPolicy
 

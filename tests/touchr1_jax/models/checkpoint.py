@@ -6,7 +6,7 @@ from pathlib import Path
 
 from experiments.paper.tiny_checkpoint import TEMPLATE
 from tests.touchr1_jax.models.qwen import cases, tiny, words
-from touchr1_jax.models.qwen.config import parse_config
+from touchr1_jax.models.qwen.config_file import parse_config
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 
 FIELDS = {

@@ -1,1 +1,1 @@
-"""Qwen2.5-VL (Bai et al. 2025, arXiv 2502.13923): vision tower, positions, prompts, published weights, and a policy."""
+"""Qwen2.5-VL (arXiv 2502.13923) and dense Qwen3-VL (arXiv 2511.21631): towers, published weights, and a policy."""

@@ -1,41 +1,49 @@
-"""Shapes of Qwen2.5-VL: the published sizes, and any other from a checkpoint's `config.json`."""
+"""Shapes of Qwen2.5-VL and of dense Qwen3-VL: the published sizes, and any other from a checkpoint's `config.json`."""
 
 import dataclasses
-import json
-import sys
+import math
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Literal
 
-from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.models.decoder_config import DecoderConfig, Qwen3DecoderConfig
 
 CONFIG_FILE = "config.json"
 COLOURS = 3
 """Channels of a picture."""
 
+CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
+CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
+"""Mean and spread of pixels in [0, 1] on CLIP's training data (Radford et al. 2021), per channel."""
+
+ROPE_THETA = 1e4
+"""Base of the vision towers' rotary angles, the same in every released checkpoint and named in none."""
+
+ModelType = Literal["qwen2_5_vl", "qwen3_vl"]
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class QwenVisionConfig:
-    """Shape of the vision tower; the defaults are the published one, which differs between sizes in its exit alone.
+class TowerConfig:
+    """Shape that the vision towers share.
 
     A patch is `patch_px`² pixels of `patch_frames` frames; `merge`² patches become one token of `out_size` channels.
-    Layers attend inside windows of `window_px`² pixels, those in `full_layers` inside the whole frame.
 
     Raises:
-      ValueError: heads that do not divide the width or cannot turn in two axes, a window that is no whole number of
-        merged patches, or full layers outside the tower.
+      ValueError: heads that do not divide the width or cannot turn in two axes.
     """
 
+    model_type: ClassVar[ModelType]
+    pixel_mean: ClassVar[tuple[float, ...]]
+    pixel_std: ClassVar[tuple[float, ...]]
+    """Pixels in [0, 1] have this mean subtracted, and are divided by this spread."""
+
     out_size: int
-    depth: int = 32
-    hidden_size: int = 1280
+    depth: int
+    hidden_size: int
     num_heads: int = 16
-    intermediate_size: int = 3420
-    patch_px: int = 14
+    intermediate_size: int
+    patch_px: int
     patch_frames: int = 2
     merge: int = 2
-    window_px: int = 112
-    full_layers: tuple[int, ...] = (7, 15, 23, 31)
 
     def __post_init__(self) -> None:
         if self.hidden_size % (4 * self.num_heads):
@@ -43,13 +51,11 @@ class QwenVisionConfig:
                 f"vision hidden_size {self.hidden_size} must be a multiple of 4 · num_heads = {4 * self.num_heads}: "
                 "a head turns by row and by column"
             )
-        if self.window_px % self.cell_px:
-            raise ValueError(
-                f"window_px {self.window_px} must be a multiple of patch_px · merge = {self.cell_px}: a window holds "
-                "whole tokens"
-            )
-        if not all(0 <= layer < self.depth for layer in self.full_layers):
-            raise ValueError(f"full layers are {list(self.full_layers)}: must lie in 0..{self.depth - 1}")
+
+    @property
+    def levels(self) -> int:
+        """K, layers of the tower whose features reach the decoder beside those of the last."""
+        return 0
 
     @property
     def cell_px(self) -> int:
@@ -63,15 +69,94 @@ class QwenVisionConfig:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class QwenVisionConfig(TowerConfig):
+    """Qwen2.5-VL's tower; the defaults are the published one, which differs between sizes in its exit alone.
+
+    Layers attend inside windows of `window_px`² pixels, those in `full_layers` inside the whole frame.
+
+    Raises:
+      ValueError: as `TowerConfig`, a window that is no whole number of merged patches, or full layers outside the
+        tower.
+    """
+
+    model_type = "qwen2_5_vl"
+    pixel_mean, pixel_std = CLIP_MEAN, CLIP_STD
+
+    depth: int = 32
+    hidden_size: int = 1280
+    intermediate_size: int = 3420
+    patch_px: int = 14
+    window_px: int = 112
+    full_layers: tuple[int, ...] = (7, 15, 23, 31)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.window_px % self.cell_px:
+            raise ValueError(
+                f"window_px {self.window_px} must be a multiple of patch_px · merge = {self.cell_px}: a window holds "
+                "whole tokens"
+            )
+        if not all(0 <= layer < self.depth for layer in self.full_layers):
+            raise ValueError(f"full layers are {list(self.full_layers)}: must lie in 0..{self.depth - 1}")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Qwen3VisionConfig(TowerConfig):
+    """Qwen3-VL's tower; the defaults are that of the 2B and the 4B.
+
+    A table of `positions` places, a square grid, is stretched over each frame.  The features of `deepstack_layers` are
+    added in the decoder, see `models.deepstack`.
+
+    Raises:
+      ValueError: as `TowerConfig`, places that are no square, or layers outside the tower or out of order.
+    """
+
+    model_type = "qwen3_vl"
+    pixel_mean = pixel_std = (0.5, 0.5, 0.5)
+
+    depth: int = 24
+    hidden_size: int = 1024
+    intermediate_size: int = 4096
+    patch_px: int = 16
+    positions: int = 2304
+    deepstack_layers: tuple[int, ...] = (5, 11, 17)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.side**2 != self.positions:
+            raise ValueError(f"num_position_embeddings is {self.positions}: must be a square, of places on a grid")
+        layers = self.deepstack_layers
+        if list(layers) != sorted({*layers}) or not all(0 <= layer < self.depth for layer in layers):
+            raise ValueError(
+                f"deepstack_visual_indexes is {list(layers)}: must rise and lie in 0..{self.depth - 1}, the layers of "
+                "the tower; correct config.json"
+            )
+
+    @property
+    def levels(self) -> int:
+        """K, layers of the tower whose features reach the decoder beside those of the last."""
+        return len(self.deepstack_layers)
+
+    @property
+    def side(self) -> int:
+        """Places along one side of the table's grid."""
+        return math.isqrt(self.positions)
+
+
+AnyVision = QwenVisionConfig | Qwen3VisionConfig
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class QwenConfig:
     """Both towers, and the ids of the tokens that stand for what is seen.
 
     Raises:
-      ValueError: vision tokens as wide as no token of the decoder, or ids outside the vocabulary or used twice.
+      ValueError: vision tokens as wide as no token of the decoder, as many levels as the decoder has layers, or ids
+        outside the vocabulary or used twice.
     """
 
     decoder: DecoderConfig
-    vision: QwenVisionConfig
+    vision: AnyVision
     vision_start_id: int = 151652
     vision_end_id: int = 151653
     image_id: int = 151655
@@ -82,6 +167,11 @@ class QwenConfig:
             raise ValueError(
                 f"vision out_size {self.vision.out_size} must equal the decoder's hidden_size "
                 f"{self.decoder.hidden_size}: vision tokens stand among text tokens"
+            )
+        if self.vision.levels >= self.decoder.num_layers:
+            raise ValueError(
+                f"deepstack_visual_indexes names {self.vision.levels} layers: must be fewer than the decoder's "
+                f"num_hidden_layers {self.decoder.num_layers}, since one is added after each; correct config.json"
             )
         ids = (self.vision_start_id, self.vision_end_id, self.image_id, self.video_id)
         if len(set(ids)) < len(ids) or not all(0 <= i < self.decoder.vocab_size for i in ids):
@@ -117,161 +207,45 @@ RELEASED: Mapping[str, DecoderConfig] = {
         tie_embedding=False,
     ),
 }
-"""Decoders of the released checkpoints (arXiv 2502.13923, table 1)."""
+"""Decoders of Qwen2.5-VL's released checkpoints (arXiv 2502.13923, table 1)."""
+
+
+def _qwen3(width: int, num_layers: int, num_heads: int, mlp: int, **vision: Any) -> QwenConfig:
+    decoder = Qwen3DecoderConfig(
+        vocab_size=151936,
+        hidden_size=width,
+        num_layers=num_layers,
+        num_heads=num_heads,
+        num_kv_heads=8,
+        head_dim=128,
+        intermediate_size=mlp,
+        mrope_section=(24, 20, 20),
+        rope_theta=5e6,
+        tie_embedding=width < 4096,
+    )
+    return QwenConfig(decoder=decoder, vision=Qwen3VisionConfig(out_size=width, **vision))
+
+
+RELEASED_QWEN3: Mapping[str, QwenConfig] = {
+    "Qwen3-VL-2B": _qwen3(2048, 28, 16, 6144),
+    "Qwen3-VL-4B": _qwen3(2560, 36, 32, 9728),
+    "Qwen3-VL-8B": _qwen3(
+        4096, 36, 32, 12288, depth=27, hidden_size=1152, intermediate_size=4304, deepstack_layers=(8, 16, 24)
+    ),
+}
+"""Shapes of the smaller dense Qwen3-VL (arXiv 2511.21631), as their `config.json` states them."""
 
 
 def released(size: str) -> QwenConfig:
-    """Shape of a released checkpoint, one of `RELEASED`.
+    """Shape of a released checkpoint, one of `RELEASED` or `RELEASED_QWEN3`.
 
     Raises:
       ValueError: another size.
     """
+    if size in RELEASED_QWEN3:
+        return RELEASED_QWEN3[size]
     if size not in RELEASED:
-        raise ValueError(f"size is {size!r}: must be one of {', '.join(RELEASED)}; read others with read_config")
+        sizes = ", ".join((*RELEASED, *RELEASED_QWEN3))
+        raise ValueError(f"size is {size!r}: must be one of {sizes}; read others with read_config")
     decoder = RELEASED[size]
     return QwenConfig(decoder=decoder, vision=QwenVisionConfig(out_size=decoder.hidden_size))
-
-
-def read_config(directory: str | Path) -> QwenConfig:
-    """Configuration of the checkpoint in a directory.
-
-    Raises:
-      FileNotFoundError: there is no `config.json`.
-      ValueError: as `parse_config`, or no JSON.
-    """
-    path = Path(directory) / CONFIG_FILE
-    if not path.is_file():
-        raise FileNotFoundError(f"{path} is no file: must be the config.json of a checkpoint; correct the directory")
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is no JSON: {error}; fetch it again") from error
-    return parse_config(found)
-
-
-def parse_config(found: Any) -> QwenConfig:
-    """Configuration from the contents of a `config.json`, flat as published or nested as newer libraries write it.
-
-    A vision tower whose file states a part of its shape has the published defaults elsewhere (32B, 72B).
-
-    Raises:
-      ValueError: a field that is missing, of another type, or that asks for what these modules do not compute.
-    """
-    root = _Fields(found, "")
-    root.require("model_type", "qwen2_5_vl")
-    text = root.part("text_config") if "text_config" in root.found else root
-    vision = root.part("vision_config")
-    tied = any(part.found.get("tie_word_embeddings", False) for part in (root, text))  # absence means no
-    return QwenConfig(
-        decoder=_decoder(text, tied=tied),
-        vision=_vision(vision),
-        vision_start_id=root.count("vision_start_token_id"),
-        vision_end_id=root.count("vision_end_token_id"),
-        image_id=root.count("image_token_id"),
-        video_id=root.count("video_token_id"),
-    )
-
-
-class _Fields:
-    """A part of a `config.json` whose missing and mistyped fields are named in full."""
-
-    def __init__(self, found: Any, prefix: str) -> None:
-        if not isinstance(found, dict):
-            raise ValueError(f"{prefix.rstrip('.') or CONFIG_FILE} is {found!r:.60}: must be an object; fetch it again")
-        self.found, self.prefix = found, prefix
-
-    def __getitem__(self, name: str) -> Any:
-        if name not in self.found:
-            raise ValueError(f"config.json lacks {self.prefix}{name}, without which the model has no shape; add it")
-        return self.found[name]
-
-    def part(self, name: str) -> "_Fields":
-        """A field that must be an object."""
-        return _Fields(self[name], f"{self.prefix}{name}.")
-
-    def require(self, name: str, value: Any, *, default: bool = False) -> None:
-        """A field that must have a value, which with `default` it has where it is missing."""
-        if name not in self.found and not default:
-            raise ValueError(f"config.json lacks {self.prefix}{name}: must be {value!r}; add it")
-        if self.found.get(name, value) != value:
-            raise ValueError(
-                f"{self.prefix}{name} is {self.found[name]!r}: must be {value!r}; another architecture cannot be read"
-            )
-
-    def count(self, name: str, default: int | None = None) -> int:
-        """A field that must be a whole number above 0."""
-        value = self[name] if default is None else self.found.get(name, default)
-        if type(value) is not int or value < 1:
-            raise ValueError(f"{self.prefix}{name} is {value!r}: must be a whole number above 0; correct config.json")
-        return value
-
-    def positive(self, name: str) -> float:
-        """A field that must be a finite number above 0."""
-        value = self[name]
-        if type(value) not in (int, float) or not 0 < value <= sys.float_info.max:
-            raise ValueError(f"{self.prefix}{name} is {value!r}: must be a number above 0; correct config.json")
-        return float(value)
-
-    def counts(self, name: str, default: tuple[int, ...] | None = None) -> tuple[int, ...]:
-        """A field that must be a list of whole numbers."""
-        value = self[name] if default is None else self.found.get(name, list(default))
-        if not isinstance(value, list) or not all(type(x) is int for x in value):
-            raise ValueError(f"{self.prefix}{name} is {value!r}: must be a list of whole numbers; correct config.json")
-        return tuple(value)
-
-
-def _decoder(text: _Fields, *, tied: bool) -> DecoderConfig:
-    text.require("hidden_act", "silu")
-    if text.found.get("use_sliding_window"):
-        raise ValueError(f"{text.prefix}use_sliding_window is true: only full attention is computed; set it to false")
-    theta, sections = _rope(text)
-    hidden, heads = text.count("hidden_size"), text.count("num_attention_heads")
-    if hidden % heads:
-        raise ValueError(f"{text.prefix}hidden_size {hidden} must be a multiple of num_attention_heads {heads}")
-    return DecoderConfig(
-        vocab_size=text.count("vocab_size"),
-        hidden_size=hidden,
-        num_layers=text.count("num_hidden_layers"),
-        num_heads=heads,
-        num_kv_heads=text.count("num_key_value_heads"),
-        head_dim=hidden // heads,
-        intermediate_size=text.count("intermediate_size"),
-        mrope_section=sections,
-        rope_theta=theta,
-        norm_epsilon=text.positive("rms_norm_eps"),
-        tie_embedding=tied,
-    )
-
-
-def _rope(text: _Fields) -> tuple[float, tuple[int, int, int]]:
-    """Base and sections of the rotary positions: `rope_theta` beside `rope_scaling`, or both in `rope_parameters`."""
-    rope = text.part("rope_parameters" if "rope_parameters" in text.found else "rope_scaling")
-    kinds = [rope.found[k] for k in ("type", "rope_type") if k in rope.found]
-    if not all(kind in ("mrope", "default") for kind in kinds):
-        raise ValueError(f"{rope.prefix}type is {kinds}: must be 'mrope' or 'default'; nothing else is computed")
-    theta = (rope if "rope_theta" in rope.found else text).positive("rope_theta")
-    sections = rope.counts("mrope_section")
-    if len(sections) != 3:
-        raise ValueError(f"{rope.prefix}mrope_section is {list(sections)}: must be three, for time, row and column")
-    return theta, sections
-
-
-def _vision(vision: _Fields) -> QwenVisionConfig:
-    vision.require("hidden_act", "silu", default=True)
-    for channels in ("in_channels", "in_chans"):
-        vision.require(channels, COLOURS, default=True)
-    if "tokens_per_second" in vision.found:  # of videos, whose positions are not computed here
-        vision.positive("tokens_per_second")
-    usual = QwenVisionConfig(out_size=vision.count("out_hidden_size"))
-    return dataclasses.replace(
-        usual,
-        depth=vision.count("depth", usual.depth),
-        hidden_size=vision.count("hidden_size"),
-        num_heads=vision.count("num_heads", usual.num_heads),
-        intermediate_size=vision.count("intermediate_size", usual.intermediate_size),
-        patch_px=vision.count("patch_size", usual.patch_px),
-        patch_frames=vision.count("temporal_patch_size", usual.patch_frames),
-        merge=vision.count("spatial_merge_size", usual.merge),
-        window_px=vision.count("window_size", usual.window_px),
-        full_layers=vision.counts("fullatt_block_indexes", usual.full_layers),
-    )

@@ -1,4 +1,4 @@
-"""Where the patches of pictures and videos lie: window order, rows and columns, and who attends to whom.
+"""Where the patches of pictures and videos lie: window order, rows and columns, places in a table, who attends to whom.
 
 All of it follows from the grids alone, so it is NumPy and constant in the compiled program.
 """
@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from touchr1_jax.models.qwen.config import QwenVisionConfig
+from touchr1_jax.models.qwen.config import Qwen3VisionConfig, QwenVisionConfig, TowerConfig
 
 
 class Grid(NamedTuple):
@@ -62,14 +62,7 @@ def geometry(grids: tuple[Grid, ...], config: QwenVisionConfig) -> Geometry:
     Raises:
       ValueError: no grid, or one whose rows and columns are no whole number of merged patches.
     """
-    if not grids:
-        raise ValueError("grids is empty: the vision tower needs a picture or video; leave the tower out for text")
-    for grid in grids:
-        if min(grid) < 1 or grid.rows % config.merge or grid.columns % config.merge:
-            raise ValueError(
-                f"grid {tuple(grid)} must have at least one step, and rows and columns in multiples of merge = "
-                f"{config.merge}; resize the picture to multiples of {config.cell_px} px"
-            )
+    check_grids(grids, config)
     side, square = config.window_px // config.cell_px, config.merge**2
     tokens, window_sizes, frame_sizes, start = [], [], [], 0
     for grid in grids:
@@ -87,6 +80,58 @@ def geometry(grids: tuple[Grid, ...], config: QwenVisionConfig) -> Geometry:
     order = (token_at[:, None] * square + np.arange(square)).ravel()
     row, column = np.concatenate([patch_places(grid, config.merge) for grid in grids], 1)[:, order]
     return Geometry(order, np.argsort(token_at), row, column, group(window_sizes), group(frame_sizes))
+
+
+class Stretched(NamedTuple):
+    """Positions and frames of the n patches of a few grids, and the four places of a table around each patch."""
+
+    row: np.ndarray  # int [n]
+    column: np.ndarray  # int [n]
+    frames: Groups
+    corner: np.ndarray  # int [4, n], places in the table
+    weight: np.ndarray  # float32 [4, n], of each in the bilinear mean
+
+
+@functools.lru_cache(maxsize=256)
+def stretched(grids: tuple[Grid, ...], config: Qwen3VisionConfig) -> Stretched:
+    """Layout of patches in the given order; the table's corners lie on those of every frame.
+
+    Args:
+      grids: pictures and videos in the order of their patches.
+      config: merge size, and places of the table.
+
+    Raises:
+      ValueError: as `geometry`.
+    """
+    check_grids(grids, config)
+    row, column = np.concatenate([patch_places(grid, config.merge) for grid in grids], 1)
+    last = lambda axis: np.repeat([getattr(g, axis) - 1 for g in grids], [g.patches for g in grids])
+    places, shares = [], []
+    for at, most in ((row, last("rows")), (column, last("columns"))):
+        place = at * (config.side - 1) / most
+        low = np.floor(place).astype(int)
+        places.append((low, np.minimum(low + 1, config.side - 1)))
+        shares.append((1 - (place - low), place - low))
+    corner = np.stack([r * config.side + c for r in places[0] for c in places[1]])
+    weight = np.stack([r * c for r in shares[0] for c in shares[1]]).astype(np.float32)
+    frames = group([g.rows * g.columns for g in grids for _ in range(g.steps)])
+    return Stretched(row, column, frames, corner, weight)
+
+
+def check_grids(grids: tuple[Grid, ...], config: TowerConfig) -> None:
+    """Refuse grids that no whole number of tokens fills.
+
+    Raises:
+      ValueError: no grid, or one whose rows and columns are no whole number of merged patches.
+    """
+    if not grids:
+        raise ValueError("grids is empty: the vision tower needs a picture or video; leave the tower out for text")
+    for grid in grids:
+        if min(grid) < 1 or grid.rows % config.merge or grid.columns % config.merge:
+            raise ValueError(
+                f"grid {tuple(grid)} must have at least one step, and rows and columns in multiples of merge = "
+                f"{config.merge}; resize the picture to multiples of {config.cell_px} px"
+            )
 
 
 def patch_places(grid: Grid, merge: int) -> np.ndarray:

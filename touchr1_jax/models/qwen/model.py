@@ -1,15 +1,17 @@
-"""Qwen2.5-VL: vision tower and decoder, on prompts that mix text with pictures and videos."""
+"""Qwen2.5-VL and Qwen3-VL: vision tower and decoder, on prompts that mix text with pictures and videos."""
 
 from typing import NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
+from touchr1_jax.models.deepstack import Levels, placed, split_levels
 from touchr1_jax.models.lm import Decoder, PrefixCache
-from touchr1_jax.models.qwen.config import QwenConfig
+from touchr1_jax.models.qwen.config import AnyVision, QwenConfig, QwenVisionConfig
 from touchr1_jax.models.qwen.geometry import Grid
+from touchr1_jax.models.qwen.qwen3_vision import Qwen3Vision
 from touchr1_jax.models.qwen.vision import QwenVision
 from touchr1_jax.types import Params
 
@@ -23,24 +25,31 @@ class Inputs(NamedTuple):
     patches: Float[Array, "n pixel"]
 
 
+def vision_tower(config: AnyVision) -> QwenVision | Qwen3Vision:
+    """The module f(patches, grids) → tokens of a config."""
+    return QwenVision(config) if isinstance(config, QwenVisionConfig) else Qwen3Vision(config)
+
+
 class QwenVL(nn.Module):
     """Parameters and forward passes; `grids` says whose the patches are and is static."""
 
     config: QwenConfig
 
     def setup(self) -> None:
-        self.vision = QwenVision(self.config.vision)
+        self.vision = vision_tower(self.config.vision)
         self.decoder = Decoder(self.config.decoder)
 
     def __call__(self, inputs: Inputs, grids: tuple[Grid, ...]) -> Float[Array, "L V"]:
         """Logits of the token that follows each token."""
-        x, mask = self._embed(inputs, grids)
-        return self._logits(self.decoder.states(x, inputs.positions, mask)[0])
+        x, levels = self._embed(inputs, grids)
+        mask = jnp.ones(inputs.ids.shape, bool)
+        return self._logits(self.decoder.states(x, inputs.positions, mask, levels)[0])
 
     def prefill(self, inputs: Inputs, grids: tuple[Grid, ...]) -> tuple[Float[Array, "V"], PrefixCache]:
         """Logits of the first token of the answer, and the cache that `extend` and `decode` of the decoder read."""
-        x, mask = self._embed(inputs, grids)
-        last, cache = self.decoder.prefill(x, inputs.positions, mask)
+        x, levels = self._embed(inputs, grids)
+        mask = jnp.ones(inputs.ids.shape, bool)
+        last, cache = self.decoder.prefill(x, inputs.positions, mask, levels=levels)
         return self._logits(last), cache
 
     def extend(self, tokens: Int[Array, "T"], prefix: PrefixCache) -> Float[Array, "T V"]:
@@ -52,11 +61,12 @@ class QwenVL(nn.Module):
         hidden, caches = self.decoder.decode(token, t, prefix, caches)
         return self._logits(hidden), caches
 
-    def _embed(self, inputs: Inputs, grids: tuple[Grid, ...]) -> tuple[Float[Array, "L D"], Bool[Array, "L"]]:
+    def _embed(self, inputs: Inputs, grids: tuple[Grid, ...]) -> tuple[Float[Array, "L D"], Levels]:
         x = self.decoder.embed(inputs.ids)
-        if grids:
-            x = x.at[inputs.slots].set(self.vision(inputs.patches, grids).astype(x.dtype))
-        return x, jnp.ones(inputs.ids.shape, bool)
+        if not grids:
+            return x, None
+        seen, levels = split_levels(self.vision(inputs.patches, grids).astype(x.dtype), x.shape[-1])
+        return x.at[inputs.slots].set(seen), placed(levels, inputs.slots, len(x))
 
     def _logits(self, states: Float[Array, "*n D"]) -> Float[Array, "*n V"]:
         return self.decoder.logits(states, jnp.zeros(self.config.decoder.vocab_size, bool))

@@ -1,5 +1,6 @@
 """Which published tensor is which parameter, and how its axes lie there."""
 
+import re
 from typing import NamedTuple
 
 import flax.traverse_util
@@ -23,6 +24,8 @@ MODULES = {
     "k_proj": "self_attn.k_proj",
     "v_proj": "self_attn.v_proj",
     "o_proj": "self_attn.o_proj",
+    "q_norm": "self_attn.q_norm",
+    "k_norm": "self_attn.k_norm",
     "gate": "gate_proj",
     "up": "up_proj",
     "down": "down_proj",
@@ -33,6 +36,14 @@ MODULES = {
     "merger_out": "merger.mlp.2",
 }
 """Published name of each module whose name differs."""
+
+ALONE = {
+    ("decoder", "head", "kernel"): "lm_head.weight",
+    ("vision", "patch_embed"): "visual.patch_embed.proj.weight",
+    ("vision", "patch_bias"): "visual.patch_embed.proj.bias",
+    ("vision", "patch_position"): "visual.pos_embed.weight",
+}
+"""Key of each parameter that is named as a whole."""
 
 Path = tuple[str, ...]
 
@@ -69,9 +80,18 @@ def canonical(key: str) -> str:
     return key
 
 
-def published(key: str) -> str:
-    """A key without prefix as released checkpoints have it."""
+def published(key: str, config: QwenConfig) -> str:
+    """A key without prefix as released checkpoints of a model have it."""
+    if config.vision.model_type == "qwen3_vl":
+        return nested(key)
     return "model." + key.removeprefix("text.") if key.startswith("text.") else key
+
+
+def nested(key: str) -> str:
+    """A key without prefix as Qwen3-VL's checkpoints have it, and transformers ≥ 4.52 in every model."""
+    if key.startswith("text."):
+        return f"model.language_model.{key.removeprefix('text.')}"
+    return f"model.{key}" if key.startswith("visual.") else key
 
 
 def sources(config: QwenConfig) -> dict[str, Source]:
@@ -92,20 +112,19 @@ def source(path: Path, shape: tuple[int, ...], config: QwenConfig, row: int | No
     Dense kernels are published as [out, in], the patch embedding as a convolution [out, colour, frame, row, column].
     """
     *modules, leaf = path
-    if path == ("decoder", "head", "kernel"):
-        return Source("lm_head.weight", shape[::-1], True, path)
-    if path == ("vision", "patch_embed"):
-        v = config.vision
-        kernel = (v.hidden_size, COLOURS, v.patch_frames, v.patch_px, v.patch_px)
-        return Source("visual.patch_embed.proj.weight", kernel, True, path)
-    key = ".".join(module_name(name, row, config) for name in modules)
-    turned = leaf == "kernel"
+    turned = leaf in ("kernel", "patch_embed")
     shape = shape[::-1] if turned else shape
+    if leaf == "patch_embed":
+        v = config.vision
+        shape = (v.hidden_size, COLOURS, v.patch_frames, v.patch_px, v.patch_px)
+    if path in ALONE:
+        return Source(ALONE[path], shape, turned, path)
+    key = ".".join(module_name(name, row, config) for name in modules)
     return Source(f"{key}.{'bias' if leaf == 'bias' else 'weight'}", shape, turned, path, row)
 
 
 def module_name(name: str, row: int | None, config: QwenConfig) -> str:
-    """Published name of a module, that of a layer with its number."""
+    """Published name of a module, that of a layer or merger with its number."""
     if name == LAST:
         return f"layers.{config.decoder.num_layers - 1}"
-    return f"{name}.{row}" if name in STACKED else MODULES.get(name, name)
+    return f"{name}.{row}" if name in STACKED else MODULES.get(name, re.sub(r"_(\d)$", r".\1", name))

@@ -39,7 +39,7 @@ def save_adapters(folder: Path, adapters: Adapters, config: QwenConfig, lora: Lo
         adapter = found.get(s.path[:-1]) if s.path[-1] == "kernel" else None
         for name, factor in () if adapter is None else adapter._asdict().items():
             of_layer = np.asarray(factor if s.row is None else factor[s.row], np.float32)
-            tensors[f"{PREFIX}{module_of(s.key)}.{FACTORS[name]}.weight"] = of_layer.T
+            tensors[f"{PREFIX}{names.nested(s.key.removesuffix('.weight'))}.{FACTORS[name]}.weight"] = of_layer.T
     write_file(folder / PEFT_WEIGHTS, tensors)
     fields = {
         "peft_type": "LORA",
@@ -111,12 +111,6 @@ def target_pattern(lora: LoraConfig) -> str:
     kinds = [rf"(?!.*visual\.).*\.({named(lora.targets)})"] if lora.targets else []
     kinds += [rf".*visual\.(.*\.)?({named(lora.vision_targets)})"] if lora.vision_targets else []
     return "|".join(kinds)
-
-
-def module_of(key: str) -> str:
-    """A key of `names.sources` as the module of transformers ≥ 4.52."""
-    module = key.removesuffix(".weight")
-    return f"model.language_model.{module.removeprefix('text.')}" if module.startswith("text.") else f"model.{module}"
 
 
 def _canonical(key: str) -> str:

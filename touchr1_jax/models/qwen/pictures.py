@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import jax
@@ -10,12 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Real, UInt8
 
-from touchr1_jax.models.qwen.config import COLOURS, QwenVisionConfig
+from touchr1_jax.models.qwen.config import CLIP_MEAN, CLIP_STD, COLOURS, ModelType, TowerConfig
 from touchr1_jax.models.qwen.geometry import Grid
-
-CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
-CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
-"""Mean and spread of pixels in [0, 1] on CLIP's training data (Radford et al. 2021), per channel."""
 
 PREPROCESSOR_FILE, PROCESSOR_FILE = "preprocessor_config.json", "processor_config.json"
 """Settings of pictures as published, and where transformers ≥ 5 writes them, as its part `image_processor`."""
@@ -35,8 +32,14 @@ class PixelBudget:
 PICTURE_BUDGET = PixelBudget(least=28 * 28 * 4, most=28 * 28 * 1280)
 """Budget of transformers' processor; a checkpoint may name another."""
 
+RELEASED_BUDGETS: Mapping[ModelType, PixelBudget] = {
+    "qwen2_5_vl": PICTURE_BUDGET,
+    "qwen3_vl": PixelBudget(least=2**16, most=2**24),
+}
+"""Type of the model → budget that its released checkpoints name."""
 
-def read_budget(directory: Path, config: QwenVisionConfig) -> PixelBudget:
+
+def read_budget(directory: Path, config: TowerConfig) -> PixelBudget:
     """Budget of pictures from a checkpoint's settings of pictures; the rest of them must be what is computed here.
 
     Args:
@@ -62,12 +65,13 @@ def read_budget(directory: Path, config: QwenVisionConfig) -> PixelBudget:
         "patch_size": config.patch_px,
         "temporal_patch_size": config.patch_frames,
         "merge_size": config.merge,
-        "image_mean": list(CLIP_MEAN),
-        "image_std": list(CLIP_STD),
+        "image_mean": list(config.pixel_mean),
+        "image_std": list(config.pixel_std),
     }
+    usual = expected | {"image_mean": list(CLIP_MEAN), "image_std": list(CLIP_STD)}  # of the processor's class
     for field, value in expected.items():
-        if found.get(field, value) != value:
-            raise ValueError(f"{path}: {field} is {found[field]}: must be {value}; take all files from one checkpoint")
+        if (written := found.get(field, usual[field])) != value:
+            raise ValueError(f"{path}: {field} is {written}: must be {value}; take all files from one checkpoint")
     size = found.get("size")
     edges = size if isinstance(size, dict) else {}
     least = found.get("min_pixels", edges.get("shortest_edge"))
@@ -120,9 +124,7 @@ def resize(frames: UInt8[Array | np.ndarray, "*n H W 3"], height: int, width: in
     return x
 
 
-def patchify(
-    frames: Real[Array | np.ndarray, "*n F H W 3"], config: QwenVisionConfig
-) -> Float[Array, "*n patch pixel"]:
+def patchify(frames: Real[Array | np.ndarray, "*n F H W 3"], config: TowerConfig) -> Float[Array, "*n patch pixel"]:
     """Cut normalised frames into patches (channel, frame, row, column), merged square by merged square.
 
     A picture is one frame; a last step that lacks frames repeats the last.
@@ -137,7 +139,7 @@ def patchify(
     grid = grid_of(frames.shape[-4:], config)
     *lead, f, _, _, _ = frames.shape
     x = jnp.asarray(frames).astype(jnp.float32) / 255.0
-    x = (x - np.array(CLIP_MEAN, np.float32)) / np.array(CLIP_STD, np.float32)
+    x = (x - np.array(config.pixel_mean, np.float32)) / np.array(config.pixel_std, np.float32)
     missing = grid.steps * config.patch_frames - f
     x = jnp.concatenate([x, jnp.repeat(x[..., -1:, :, :, :], missing, -4)], -4)
     m, p = config.merge, config.patch_px
@@ -148,7 +150,7 @@ def patchify(
     return x.reshape(*lead, grid.patches, config.patch_size)
 
 
-def grid_of(shape: tuple[int, ...], config: QwenVisionConfig) -> Grid:
+def grid_of(shape: tuple[int, ...], config: TowerConfig) -> Grid:
     """Grid of frames of the given (frames, height, width, channels).
 
     Raises:

@@ -1,6 +1,7 @@
-"""A policy on a pretrained Qwen2.5-VL: its vision tower for the view, its decoder, and a tactile encoder of our own.
+"""A policy on a pretrained Qwen-VL: its vision tower for the view, its decoder, and a tactile encoder of our own.
 
-The tactile tokens stand in the prompt where those of a video would, with integer frame indices as time ids.
+The tactile tokens stand in the prompt where those of a video would: on Qwen2.5-VL with integer frame indices as time
+ids, on Qwen3-VL step by step after the time in words (`text.chat`).
 """
 
 import dataclasses
@@ -13,10 +14,10 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from touchr1_jax.models.policy import Policy, PolicyConfig, Slots, init_policy
 from touchr1_jax.models.policy_fns import PolicyFns
-from touchr1_jax.models.qwen.config import QwenConfig, QwenVisionConfig
+from touchr1_jax.models.qwen.config import AnyVision, QwenConfig
 from touchr1_jax.models.qwen.geometry import Grid
+from touchr1_jax.models.qwen.model import vision_tower
 from touchr1_jax.models.qwen.pictures import PICTURE_BUDGET, PixelBudget, fitting_size, patchify, resize
-from touchr1_jax.models.qwen.vision import QwenVision
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.text.template import PromptLayout
 from touchr1_jax.text.tokenizer import Tokenizer
@@ -27,7 +28,7 @@ from touchr1_jax.types import Params, TouchBatch
 class QwenViewConfig:
     """The vision tower and the size of the pictures that it is shown, pixels; they are resized within `budget`."""
 
-    tower_config: QwenVisionConfig
+    tower_config: AnyVision
     height_px: int
     width_px: int
     budget: PixelBudget = PICTURE_BUDGET
@@ -55,14 +56,14 @@ class QwenViewConfig:
 
 
 class QwenView(nn.Module):
-    """f(view) → tokens of the decoder's width, row by row: resized, cut into patches, through the vision tower."""
+    """f(view) → tokens for the decoder, row by row: resized, cut into patches, through the vision tower."""
 
     config: QwenViewConfig
 
     def setup(self) -> None:
-        self.tower = QwenVision(self.config.tower_config)
+        self.tower = vision_tower(self.config.tower_config)
 
-    def __call__(self, view: UInt8[Array, "P H W 3"]) -> Float[Array, "P token D"]:
+    def __call__(self, view: UInt8[Array, "P H W 3"]) -> Float[Array, "P token E"]:
         """Encode P pictures, none of which sees another.
 
         Raises:

@@ -7,12 +7,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from touchr1_jax.models.layers import GatedMLP, RMSNorm, Rotation, rotate
-from touchr1_jax.models.qwen.config import QwenVisionConfig
+from touchr1_jax.models.qwen.config import ROPE_THETA, QwenVisionConfig, TowerConfig
 from touchr1_jax.models.qwen.geometry import Geometry, Grid, Groups, geometry
 from touchr1_jax.models.stacked import scan_layers
-
-ROPE_THETA = 1e4
-"""Base of the tower's rotary angles, the same in every released checkpoint and named in none."""
 
 
 class QwenVision(nn.Module):
@@ -35,15 +32,11 @@ class QwenVision(nn.Module):
           ValueError: patches that are not those of the grids, or as `geometry`.
         """
         c = self.config
-        expected = (sum(g.patches for g in grids), c.patch_size)
-        if patches.shape != expected:
-            raise ValueError(
-                f"patches are {patches.shape}, grids {tuple(map(tuple, grids))} have {expected}; match them"
-            )
+        check_patches(patches, grids, c)
         place = geometry(grids, c)
         kernel = self.param("patch_embed", nn.initializers.lecun_normal(), (c.patch_size, c.hidden_size))
         x = patches[place.order].astype(kernel.dtype) @ kernel
-        rotation = axial_rotation(place, c.hidden_size // c.num_heads)
+        rotation = axial_rotation(place.row, place.column, c.hidden_size // c.num_heads)
         whole_frames = jnp.isin(jnp.arange(c.depth), jnp.array(c.full_layers, jnp.int32))
         again = nn.remat(lambda block, y, whole: block(y, rotation, place, whole), prevent_cse=False)
         x, _ = scan_layers(lambda *args: (again(*args), None), c.depth)(VisionBlock(c, name="blocks"), x, whole_frames)
@@ -64,12 +57,30 @@ class VisionBlock(nn.Module):
         """All patches; inside the whole frame or inside windows."""
         c = self.config
         qkv = nn.Dense(3 * c.hidden_size, name="qkv")(RMSNorm(name="norm1")(x))
-        q, k, v = jnp.split(qkv.reshape(x.shape[0], 3 * c.num_heads, -1), 3, 1)
-        turn = lambda y: rotate(y.astype(jnp.float32), rotation).astype(y.dtype)  # angles are never rounded to bf16
         over = lambda groups: lambda q, k, v: attend_within(q, k, v, groups)
-        mixed = jax.lax.cond(whole, over(place.frames), over(place.windows), turn(q), turn(k), v)
+        mixed = jax.lax.cond(whole, over(place.frames), over(place.windows), *turned(qkv, c.num_heads, rotation))
         x = x + nn.Dense(c.hidden_size, name="proj")(mixed)
         return x + GatedMLP(c.intermediate_size, use_bias=True, name="mlp")(RMSNorm(name="norm2")(x))
+
+
+def check_patches(patches: Array, grids: tuple[Grid, ...], config: TowerConfig) -> None:
+    """Refuse patches that are not those of the grids.
+
+    Raises:
+      ValueError: naming both shapes.
+    """
+    expected = (sum(g.patches for g in grids), config.patch_size)
+    if patches.shape != expected:
+        raise ValueError(f"patches are {patches.shape}, grids {tuple(map(tuple, grids))} have {expected}; match them")
+
+
+def turned(
+    qkv: Float[Array, "n width"], heads: int, rotation: Rotation
+) -> tuple[Float[Array, "n H d"], Float[Array, "n H d"], Float[Array, "n H d"]]:
+    """Queries and keys after their rotation, and values; angles are never rounded to bfloat16."""
+    q, k, v = jnp.split(qkv.reshape(len(qkv), 3 * heads, -1), 3, 1)
+    turn = lambda y: rotate(y.astype(jnp.float32), rotation).astype(y.dtype)
+    return turn(q), turn(k), v
 
 
 def attend_within(
@@ -84,11 +95,11 @@ def attend_within(
     return flat if groups.even else flat[groups.back]
 
 
-def axial_rotation(place: Geometry, head_dim: int) -> Rotation:
+def axial_rotation(row: np.ndarray, column: np.ndarray, head_dim: int) -> Rotation:
     """Rotary angles of each patch: the first half of a head's frequencies turn by row, the other by column.
 
     Frequency j of an axis is θ^(−4j/d), j < d/4 (Qwen2-VL, arXiv 2409.12191, §2.1).
     """
     frequency = ROPE_THETA ** (-np.arange(0, head_dim, 4, dtype=np.float64) / head_dim)
-    angle = np.concatenate([place.row[:, None] * frequency, place.column[:, None] * frequency], -1)
+    angle = np.concatenate([row[:, None] * frequency, column[:, None] * frequency], -1)
     return Rotation(jnp.asarray(np.cos(angle), jnp.float32), jnp.asarray(np.sin(angle), jnp.float32))

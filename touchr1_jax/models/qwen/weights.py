@@ -73,8 +73,8 @@ def load_params(
         loaded[s.path] = jax.block_until_ready(found)
         if not finite:
             raise ValueError(
-                f"{entries[s.key].path}: {published(s.key)} holds NaN or infinity as {jnp.dtype(dtype)}: must be "
-                "finite; fetch the weights again, or load them in float32"
+                f"{entries[s.key].path}: {published(s.key, config)} holds NaN or infinity as {jnp.dtype(dtype)}: must "
+                "be finite; fetch the weights again, or load them in float32"
             )
         done += entries[s.key].size
         progress(done, size)
@@ -97,7 +97,7 @@ def require_fit(
                 f"{head.path}: {HEAD} differs from the embedding, which config.json ties to it; set "
                 "tie_word_embeddings to false, or fetch the files again"
             )
-    misfits = compare(entries, {s.key: s.shape for s in wanted.values()})
+    misfits = compare(entries, {s.key: s.shape for s in wanted.values()}, config)
     if misfits:
         more = f"\n  … and {len(misfits) - SHOWN} more" if len(misfits) > SHOWN else ""
         listed = "".join(f"\n  {line}" for line in misfits[:SHOWN])
@@ -122,12 +122,15 @@ def find_tensors(directory: Path) -> dict[str, safetensors.TensorEntry]:
     return found
 
 
-def compare(entries: Mapping[str, safetensors.TensorEntry], wanted: Mapping[str, tuple[int, ...]]) -> list[str]:
+def compare(
+    entries: Mapping[str, safetensors.TensorEntry], wanted: Mapping[str, tuple[int, ...]], config: QwenConfig
+) -> list[str]:
     """Mismatches, one line each, by published keys: missing, extra, shape, type."""
-    missing = [f"missing: {published(key)} {shape}" for key, shape in wanted.items() if key not in entries]
-    strangers = [(published(key), entry) for key, entry in entries.items() if key not in wanted]
+    name = lambda key: published(key, config)
+    missing = [f"missing: {name(key)} {shape}" for key, shape in wanted.items() if key not in entries]
+    strangers = [(name(key), entry) for key, entry in entries.items() if key not in wanted]
     extra = [f"extra: {key} {entry.shape} in {entry.path.name}" for key, entry in strangers]
-    shared = [(published(key), entries[key], shape) for key, shape in wanted.items() if key in entries]
+    shared = [(name(key), entries[key], shape) for key, shape in wanted.items() if key in entries]
     shapes = [
         f"shape: {key} is {entry.shape}, expected {shape}" for key, entry, shape in shared if entry.shape != shape
     ]
@@ -160,7 +163,7 @@ def save_params(
     if differ := sorted("/".join(p) for p in flat.keys() ^ {s.path for s in wanted.values()}):
         raise ValueError(f"params and config differ in {', '.join(differ[:SHOWN])}; save with the config of the params")
     host = {name: np.asarray(x) for name, x in flat.items()}
-    tensors = {published(s.key): names.write(host[s.path], s) for s in wanted.values()}
+    tensors = {published(s.key, config): names.write(host[s.path], s) for s in wanted.values()}
     safetensors.write_file(path, tensors, progress)
 
 

@@ -14,6 +14,7 @@ import torch
 import transformers
 from transformers.models.qwen2_5_vl import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
+from transformers.models.qwen3_vl import Qwen3VLConfig, Qwen3VLForConditionalGeneration
 
 from tests.touchr1_jax.models.qwen import cases
 from tests.touchr1_jax.models.qwen.cases import CASES, Case, Picture, Video
@@ -22,11 +23,17 @@ ROUNDING = 2e-5
 """Largest difference of two float32 runs of the reference, relative to the largest logit."""
 
 
-def reference_model(case: Case) -> Qwen2_5_VLForConditionalGeneration:
+Reference = Qwen2_5_VLForConditionalGeneration | Qwen3VLForConditionalGeneration
+
+
+def reference_model(case: Case) -> Reference:
     """The reference with weights by formula."""
-    config = Qwen2_5_VLConfig(**case.config())
+    kinds = Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
+    if case.shape is not None:
+        kinds = Qwen3VLConfig, Qwen3VLForConditionalGeneration
+    config = kinds[0](**case.config())
     config._attn_implementation = "eager"
-    model = Qwen2_5_VLForConditionalGeneration(config).float().eval()
+    model = kinds[1](config).float().eval()
     with torch.no_grad():
         for name, weight in model.named_parameters():
             weight.copy_(torch.from_numpy(cases.tensor(without_prefix(name), tuple(weight.shape))))
@@ -53,12 +60,12 @@ def reference_inputs(name: str, case: Case) -> dict[str, torch.Tensor]:
         if parts:
             inputs[pixels] = torch.from_numpy(np.concatenate([cases.patches(f"{name} {i}", p) for i, p in parts]))
             inputs[grid] = torch.tensor([[cases.steps(p), p.rows, p.columns] for _, p in parts])
-            if kind is Video:
+            if kind is Video and case.shape is None:
                 inputs["second_per_grid_ts"] = torch.tensor([p.seconds_per_step for _, p in parts])
     return inputs
 
 
-def positions(model: Qwen2_5_VLForConditionalGeneration, case: Case, inputs: dict[str, torch.Tensor]) -> torch.Tensor:
+def positions(model: Reference, case: Case, inputs: dict[str, torch.Tensor]) -> torch.Tensor:
     """Position ids by the reference, or, where it has left the released model, by the released model's rule."""
     if case.ids_as_reference:
         if not case.seen():

@@ -5,8 +5,9 @@ import json
 
 import pytest
 
-from tests.touchr1_jax.models.qwen.cases import config_json
-from touchr1_jax.models.qwen.config import QwenConfig, QwenVisionConfig, parse_config, read_config, released
+from tests.touchr1_jax.models.qwen.cases import SHAPES, config_json, qwen3_json
+from touchr1_jax.models.qwen.config import QwenConfig, QwenVisionConfig, released
+from touchr1_jax.models.qwen.config_file import parse_config, read_config
 
 SEVEN_B = {
     "model_type": "qwen2_5_vl",
@@ -144,6 +145,90 @@ def test_missing_nested_field_is_named_in_full():
     del broken["text_config"]["num_hidden_layers"]
     with pytest.raises(ValueError, match=r"lacks text_config\.num_hidden_layers"):
         parse_config(broken)
+
+
+QWEN3_4B = qwen3_json(SHAPES[0]) | {
+    "image_token_id": 151655,
+    "video_token_id": 151656,
+    "vision_start_token_id": 151652,
+    "vision_end_token_id": 151653,
+    "text_config": {
+        "attention_bias": False,
+        "attention_dropout": 0.0,
+        "dtype": "bfloat16",
+        "head_dim": 128,
+        "hidden_act": "silu",
+        "hidden_size": 2560,
+        "intermediate_size": 9728,
+        "model_type": "qwen3_vl_text",
+        "num_attention_heads": 32,
+        "num_hidden_layers": 36,
+        "num_key_value_heads": 8,
+        "rms_norm_eps": 1e-06,
+        "rope_scaling": {"mrope_interleaved": True, "mrope_section": [24, 20, 20], "rope_type": "default"},
+        "rope_theta": 5000000,
+        "tie_word_embeddings": True,
+        "vocab_size": 151936,
+    },
+    "vision_config": {
+        "deepstack_visual_indexes": [5, 11, 17],
+        "depth": 24,
+        "hidden_act": "gelu_pytorch_tanh",
+        "hidden_size": 1024,
+        "in_channels": 3,
+        "intermediate_size": 4096,
+        "model_type": "qwen3_vl",
+        "num_heads": 16,
+        "num_position_embeddings": 2304,
+        "out_hidden_size": 2560,
+        "patch_size": 16,
+        "spatial_merge_size": 2,
+        "temporal_patch_size": 2,
+    },
+}
+"""The fields of the released Qwen3-VL-4B's file that matter."""
+
+
+def test_released_qwen3_config_is_read():
+    assert parse_config(QWEN3_4B) == released("Qwen3-VL-4B")
+
+
+@pytest.mark.parametrize(
+    ("part", "change", "message"),
+    [
+        (
+            "",
+            {"model_type": "qwen3_vl_moe"},
+            "must be 'qwen2_5_vl' or 'qwen3_vl'; mixtures of experts are not computed",
+        ),
+        ("text_config", {"attention_bias": True}, "text_config.attention_bias is True: must be False"),
+        ("text_config", {"head_dim": 96}, r"mrope_section is \[24, 20, 20\]: must sum to half of head_dim, 48"),
+        ("text_config", {"head_dim": None}, "text_config.head_dim is None: must be a whole number above 0"),
+        (
+            "text_config",
+            {"num_hidden_layers": 3},
+            "names 3 layers: must be fewer than the decoder's",
+        ),
+        ("text_config", {"rope_scaling": {"mrope_section": [24, 20]}}, "must be three"),
+        ("text_config", {"rope_scaling": {"mrope_section": [24, 20, 20], "mrope_interleaved": False}}, "must be True"),
+        ("vision_config", {"deepstack_visual_indexes": [5, 24]}, r"is \[5, 24\]: must rise and lie in 0\.\.23"),
+        ("vision_config", {"deepstack_visual_indexes": [11, 5]}, r"is \[11, 5\]: must rise"),
+        ("vision_config", {"deepstack_visual_indexes": 3}, "must be a list of whole numbers"),
+        ("vision_config", {"num_position_embeddings": 2300}, "is 2300: must be a square"),
+        ("vision_config", {"hidden_act": "silu"}, "hidden_act is 'silu': must be 'gelu_pytorch_tanh'"),
+    ],
+)
+def test_what_is_not_computed_of_qwen3_is_refused(part, change, message):
+    with pytest.raises(ValueError, match=message):
+        parse_config(QWEN3_4B | ({part: QWEN3_4B[part] | change} if part else change))
+
+
+@pytest.mark.parametrize("part", ["text_config", "vision_config"])
+def test_a_missing_field_of_qwen3_is_named(part):
+    optional = {"attention_bias", "attention_dropout", "dtype", "model_type", "tie_word_embeddings", "in_channels"}
+    for field in QWEN3_4B[part].keys() - optional:
+        with pytest.raises(ValueError, match=rf"config\.json lacks {part}\.{field}"):
+            parse_config(QWEN3_4B | {part: {k: v for k, v in QWEN3_4B[part].items() if k != field}})
 
 
 def test_unknown_size_is_refused():

@@ -13,7 +13,6 @@ import pytest
 from tests.touchr1_jax.models.qwen import cases, tiny
 from tests.touchr1_jax.models.qwen.cases import CASES
 from touchr1_jax.models.blocked_attention import LayerCache
-from touchr1_jax.models.lm import Caches
 from touchr1_jax.models.qwen.model import QwenVL
 from touchr1_jax.types import Params
 
@@ -32,11 +31,11 @@ def params(tmp_path_factory):
     """Parameters of each case, read through the loader once for each distinct checkpoint."""
 
     @functools.cache
-    def read(window_px: int, tied: bool) -> Params:
-        case = next(c for c in CASES.values() if (c.window_px, c.tied) == (window_px, tied))
+    def read(*differs: object) -> Params:
+        case = next(c for c in CASES.values() if (c.window_px, c.tied, c.shape) == differs)
         return tiny.params_of(case, tmp_path_factory.mktemp("checkpoint"))
 
-    return lambda case: read(case.window_px, case.tied)
+    return lambda case: read(case.window_px, case.tied, case.shape)
 
 
 def close(ours: jax.Array, theirs: np.ndarray) -> None:
@@ -57,7 +56,7 @@ def test_logits_are_those_of_the_reference(name, golden, params):
     close(forward(params(CASES[name]), tiny.inputs_of(name)), theirs)
 
 
-@pytest.mark.parametrize("name", ["mixed"])
+@pytest.mark.parametrize("name", ["mixed", "qwen3_mixed_1"])
 def test_cached_answers_are_the_full_forward_pass(name, golden, params):
     """The prompt without its last words, then these words at once, and one by one."""
     case, last = CASES[name], 4
@@ -71,8 +70,7 @@ def test_cached_answers_are_the_full_forward_pass(name, golden, params):
     answer = whole.ids[-last:]
     close(jax.jit(lambda o, past: run(QwenVL.extend, o, past))(answer, prefix), theirs[1:])
     c = model.config.decoder
-    zeros = lambda *n: LayerCache(*(jnp.zeros((*n, c.num_kv_heads, last, c.head_dim)),) * 2)
-    caches = Caches(zeros(c.num_layers - 1), zeros())
+    caches: tuple = (LayerCache(*(jnp.zeros((c.num_kv_heads, last, c.head_dim)),) * 2),) * c.num_layers
     step = jax.jit(lambda token, t, past, caches: run(QwenVL.decode, token, t, past, caches))
     for t in range(last):
         logits, caches = step(answer[t], jnp.int32(t), prefix, caches)

@@ -146,3 +146,19 @@ def test_peft_computes_the_same_logits_and_writes_what_is_read_again(folder, tmp
     assert np.abs(plain - theirs).max() > 0.1 * scale
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-5 * scale)
     assert dataclasses.replace(lora, targets=LORA.targets, vision_targets=LORA.vision_targets) == LORA
+
+
+def test_adapters_of_qwen3_are_named_as_its_modules(tmp_path):
+    """The second merger of DeepStack stands alone; MLPs and mergers have layers of one name."""
+    config = tiny.config_of(CASES["qwen3_mixed_1"])
+    lora = LoraConfig(rank=2, targets=("q_proj",), vision_targets=("qkv", "linear_fc1"))
+    shapes = jax.eval_shape(lambda: init_adapters(jax.random.key(0), abstract_params(config), lora))
+    rng = np.random.default_rng(0)
+    drawn = jax.tree.map(lambda x: jnp.asarray(rng.normal(0, 0.2, x.shape), jnp.float32), shapes)
+    save_adapters(tmp_path, drawn, config, lora, "released")
+    header = read_header(tmp_path / "adapter_model.safetensors")
+    merger = read_tensor(header[f"{PREFIX}visual.deepstack_merger_list.1.linear_fc1.lora_A.weight"])
+    np.testing.assert_array_equal(merger, drawn["vision"]["deepstack_merger_list_1"]["linear_fc1"]["a"].T)
+    blocks, levels = config.vision.depth, config.vision.levels
+    assert len(header) == 2 * (config.decoder.num_layers + 2 * blocks + 1 + levels)
+    jax.tree.map(np.testing.assert_array_equal, load_adapters(tmp_path, config)[0], drawn)

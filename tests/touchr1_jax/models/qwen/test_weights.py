@@ -56,7 +56,9 @@ def write_shards(directory, weights: dict[str, np.ndarray], count: int = 3) -> N
     (directory / "model.safetensors.index.json").write_text(json.dumps({"metadata": {}, "weight_map": place}))
 
 
-@pytest.mark.parametrize(("size", "count"), [("3B", 3_754_622_976), ("7B", 8_292_166_656)])
+@pytest.mark.parametrize(
+    ("size", "count"), [("3B", 3_754_622_976), ("7B", 8_292_166_656), ("Qwen3-VL-4B", 4_437_815_808)]
+)
 def test_released_sizes_have_as_many_parameters_as_published(size, count):
     """Half the `total_size` of the released index files, which count bytes of bfloat16."""
     assert sum(math.prod(x.shape) for x in jax.tree.leaves(abstract_params(released(size)))) == count

@@ -12,7 +12,8 @@ import numpy as np
 from tests.touchr1_jax.models.qwen import cases
 from tests.touchr1_jax.models.qwen.cases import CASES, Case, Video
 from touchr1_jax.models.qwen import safetensors
-from touchr1_jax.models.qwen.config import QwenConfig, parse_config
+from touchr1_jax.models.qwen.config import QwenConfig
+from touchr1_jax.models.qwen.config_file import parse_config
 from touchr1_jax.models.qwen.geometry import Grid
 from touchr1_jax.models.qwen.model import Inputs
 from touchr1_jax.models.qwen.names import published, sources
@@ -26,7 +27,7 @@ def config_of(case: Case) -> QwenConfig:
 
 def tensors(config: QwenConfig) -> dict[str, np.ndarray]:
     """Weights by formula under their published names."""
-    return {published(s.key): cases.tensor(s.key, s.shape) for s in sources(config).values()}
+    return {published(s.key, config): cases.tensor(s.key, s.shape) for s in sources(config).values()}
 
 
 def write_weights(directory: Path, config: QwenConfig) -> None:
@@ -71,14 +72,20 @@ def position_ids(runs: Sequence[int | Block]) -> np.ndarray:
 
 
 def runs_of(case: Case) -> list[int | Block]:
-    """A case as `position_ids` reads it; step t of a video has the time id ⌊t · seconds per step · 2⌋."""
+    """A case as `position_ids` reads it; step t of a video has the time id ⌊t · seconds per step · 2⌋, in Qwen3-VL a
+    block of its own after words."""
     runs: list[int | Block] = []
     for part in case.parts:
         if isinstance(part, int):
             runs.append(part)
             continue
+        rows, columns = part.rows // cases.MERGE, part.columns // cases.MERGE
+        if case.shape is not None:
+            for _ in range(cases.steps(part)):
+                runs += [cases.STAMP * isinstance(part, Video) + 1, Block([0], rows, columns), 1]
+            continue
         times = [int(2 * t * part.seconds_per_step) for t in range(part.steps)] if isinstance(part, Video) else [0]
-        runs += [1, Block(times, part.rows // cases.MERGE, part.columns // cases.MERGE), 1]
+        runs += [1, Block(times, rows, columns), 1]
     return runs
 
 
