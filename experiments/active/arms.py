@@ -113,11 +113,7 @@ def make_policy(world: TouchWorld, config: LearnerConfig) -> ActivePolicy:
 
 
 def check_arms(world: TouchWorld, policy: ActivePolicy, arms: Mapping[str, Arm]) -> None:
-    """Try every arm's budget and prices on the objects of reinforcement before anything is trained.
-
-    Raises:
-      EnvironmentCheckError, RewardError: as `train_active`.
-    """
+    """Try every arm's budget and prices on the objects of reinforcement before anything is trained."""
     bank = part_of(world.bank, world.parts["reinforced"])
     nothing = np.zeros(0, int)
     for arm in arms.values():

@@ -180,11 +180,7 @@ def kept_frames(sequence: Sequence, config: ContactsConfig) -> UInt8[np.ndarray,
 
 
 def recorded_frames(sequence: Sequence, config: ContactsConfig) -> UInt8[np.ndarray, "F H W 3"]:
-    """The frames that are kept of a recording, whose phases nothing tells: those that stand for it.
-
-    Raises:
-      SchemaError: fewer frames than are kept.
-    """
+    """The frames that are kept of a recording, whose phases nothing tells: those that stand for it."""
     chosen = salient_frames(sequence, config.moments, ())
     if len(chosen) < config.moments:
         raise SchemaError(f"{sequence.name} has {len(chosen)} frames: must have {config.moments}; record longer")

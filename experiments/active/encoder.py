@@ -162,16 +162,7 @@ def train_reader(
     context: Context,
     seed: int,
 ) -> ContactReader:
-    """A network that learned from the contacts of some objects.
-
-    Args:
-      config: of the network.
-      statistics: of all contacts.
-      label: level of each property.
-      objects: those that it learns from.
-      context: of the run.
-      seed: of parameters and draws, and the number of its stage.
-    """
+    """A network that learned from the contacts of some objects; `seed` is that of parameters and draws."""
     choice = np.arange(statistics.shape[1], dtype=np.int32)
     fresh = ContactReader(params={}, centre=statistics[objects].mean(0), spread=statistics[objects].std(0))
     scaled = fresh.scaled(statistics, np.broadcast_to(choice, statistics.shape[:2]))

@@ -65,11 +65,7 @@ def headroom(
 ) -> dict[tuple[str, int], Float[np.ndarray, "n A"]]:
     """Worth of every plan for every object that is scored, by plan and greatest number of contacts.
 
-    Args:
-      find: beliefs about the objects on which plans are looked up.
-      score: beliefs about the objects that are scored.
-      contacts: greatest number of contacts.
-      kept: plans of several contacts consist of the choices that are best alone, so many for each question.
+    Plans are looked up in `find`; those of several contacts consist of the `kept` choices that are best alone.
     """
     found = {(EVERY, 0): _each(score, lambda a: score.worth(a, tuple(range(score.log_probs.shape[1]))))}
     for count in range(1, contacts + 1):

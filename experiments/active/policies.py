@@ -86,16 +86,7 @@ def warm_up(
     stage: str,
     seed: int,
 ) -> Params:
-    """SFT of a fresh policy on touches drawn at random, which ends in the right answer.
-
-    Args:
-      policy: to train.
-      bank: contacts of the objects to learn from.
-      contacts: most touches of a trajectory.
-      config: of SFT.
-      context, stage: of the run.
-      seed: of parameters and draws.
-    """
+    """SFT of a fresh policy on up to so many touches drawn at random, which ends in the right answer."""
     feed = RandomTouchFeed(policy, bank, budget=contacts, batch_size=config.batch_size, seed=seed)
     with stage_hooks(context, stage, config.steps) as hooks:
         return train_sft(policy, policy.init(seed, bank.tokens.shape[-1]), feed, config, hooks, seed=seed)
@@ -149,16 +140,7 @@ def reinforce(
 ) -> Params:
     """GRPO on trajectories about the objects of a bank; alarms are logged and printed once each.
 
-    Args:
-      policy, params: where it starts.
-      bank: contacts of the objects to learn from.
-      config: of a step; the length follows from the budget.
-      budget: most contacts.
-      prices: of a second and of harm.
-      dropout: probability that a sensor or a motion drops out of a prompt.
-      loop: number of steps.
-      context, stage: of the run.
-      seed: of draws.
+    The length of a step follows from the budget; a sensor or a motion drops out of a prompt with probability `dropout`.
     """
     config = dataclasses.replace(config, length=policy.tokens(budget))
     feed = ActiveFeed(policy, bank, batch_size=config.drawn, seed=seed, dropout=dropout)

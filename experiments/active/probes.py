@@ -36,11 +36,7 @@ def probe_beliefs(
 ) -> Float[np.ndarray, "O C A K"]:
     """Log-probabilities of every level from every contact, by a probe of each choice and property.
 
-    Args:
-      features: of all contacts.
-      label: level of each property.
-      fitted: objects that the probes are fitted on; beliefs about these are too good.
-      context: of the run.
+    Beliefs about the objects that the probes are fitted on are too good.
     """
     objects, choices = features.shape[:2]
     weights = np.zeros((1, objects), bool)

@@ -111,11 +111,7 @@ class VideoWorld:
 
 
 def read_videos(config: StoppingConfig, source: Path, context: Context) -> VideoWorld:
-    """The labelled objects of PhysiCLeAR's layout that have enough videos.
-
-    Raises:
-      ConfigurationError: fewer objects than folds.
-    """
+    """The labelled objects of PhysiCLeAR's layout that have enough videos."""
     return world_of(config, describe_source(source, config.frames, context).labelled())
 
 

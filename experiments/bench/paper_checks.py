@@ -59,11 +59,7 @@ def best_weighting(main: MainTable = paper.MAIN) -> tuple[np.ndarray, float]:
 
 
 def perfect_average(main: MainTable = paper.MAIN) -> float:
-    """The largest Avg 100 Σ w of a perfect model under any weights w ≥ 0 that give every printed Avg; a mean gives 100.
-
-    Raises:
-      ValueError: no weights give every Avg.
-    """
+    """The largest Avg 100 Σ w of a perfect model under weights w ≥ 0 that give every printed Avg; a mean has 100."""
     low, high, average = columns_as_scores(main)
     limits = np.concatenate([average + SHARE_ROUNDING, SHARE_ROUNDING - average])
     found = optimize.linprog(-np.ones(low.shape[1]), A_ub=np.concatenate([low, -high]), b_ub=limits)

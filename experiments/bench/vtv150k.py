@@ -115,11 +115,7 @@ def run(config: VTVProtocolConfig, context: Context) -> Results:
 
 
 def one_each(scenes: LiveScenes) -> dict[str, list[int]]:
-    """The first contact of every motion with each object that has one of all, objects in the same order.
-
-    Raises:
-      DataError: no object has one of each.
-    """
+    """The first contact of every motion with each object that has one of all, objects in the same order."""
     by_object = lambda rows: {scenes.contacts[row].object_id: row for row in reversed(rows)}
     first: dict[str, dict[str, int]] = {name: by_object(contacts_of(scenes, name)) for name in MOTIONS}
     shared = sorted(set.intersection(*(set(rows) for rows in first.values())))

@@ -150,11 +150,7 @@ def _point(name: str, row: Mapping[str, Estimate], colour: str, marker: str) -> 
 
 
 def running_mean(values: np.ndarray) -> np.ndarray:
-    """Centred mean over a twentieth of the points, the window cut off at the ends.
-
-    Args:
-      values: float [n].
-    """
+    """Centred mean of values [n] over a twentieth of them, the window cut off at the ends."""
     half = len(values) // 40
     total = np.concatenate([[0.0], np.cumsum(values)])
     low = np.maximum(np.arange(len(values)) - half, 0)

@@ -84,11 +84,7 @@ def stage_hooks(
 
 
 def left_out_tables(lines: Iterable[Mapping[str, Any]]) -> tuple[Table, ...]:
-    """A table of the updates and groups that training left out because a number was not finite, if there were any.
-
-    Args:
-      lines: those of `metrics.jsonl`.
-    """
+    """A table of the updates and groups that training left out for a number that was not finite, if there were any."""
     stages: dict[str, list[Mapping[str, Any]]] = {}
     for line in lines:
         stages.setdefault(line["stage"], []).append(line)

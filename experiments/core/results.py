@@ -291,11 +291,7 @@ class Results:
                 require(ok, f"{field}.{name}", share, "must lie in [0, 1]", "correct it")
 
     def to_json(self, description: Mapping[str, Any]) -> dict[str, Any]:
-        """The content of `results.json`.
-
-        Args:
-          description: that of the run's `config.json`: `experiment`, `scale`, `config` and `git`.
-        """
+        """The content of `results.json`; `description` is that of the run's `config.json`."""
         arms = ("arms", "baselines", "comparisons") if self.arms else ()
         names = (*arms, "verdict", "tables", "settings", "timing", "data")
         git = description["git"]

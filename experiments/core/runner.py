@@ -163,11 +163,7 @@ def run(arguments: Sequence[str], package: str = "experiments") -> int:
 
 
 def load(name: str, package: str = "experiments") -> tuple[Experiment[Any], str]:
-    """An experiment of a package and its docstring.
-
-    Raises:
-      ValueError: its module names it otherwise.
-    """
+    """An experiment of a package and its docstring."""
     module = importlib.import_module(find(package)[name].module)
     if module.EXPERIMENT.name != name:
         raise ValueError(
@@ -177,13 +173,7 @@ def load(name: str, package: str = "experiments") -> tuple[Experiment[Any], str]
 
 
 def run_experiment(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> int:
-    """Run or continue an experiment; returns the exit code, 128 + n after signal n.
-
-    Args:
-      experiment: with its configurations.
-      arguments: of the command line after its name.
-      about: its docstring, whose first line is the question.
-    """
+    """Run or continue an experiment, whose docstring is `about`; returns the exit code, 128 + n after signal n."""
     try:
         command = parse(experiment, arguments, about)
         jsonable(command.config, where="config")

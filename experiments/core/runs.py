@@ -104,12 +104,7 @@ def create(home: Path, description: dict[str, Any]) -> Path:
 def describe(
     name: str, scale: str, config: Any, command: str, *, settings: Mapping[str, Any], devices: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The content of `config.json`: the resolved configuration and everything needed to run it again.
-
-    Args:
-      name, scale, config, command: of the experiment.
-      settings, devices: those of `numerics`.
-    """
+    """The content of `config.json`: the resolved configuration and everything needed to run it again."""
     return {
         "experiment": name,
         "scale": scale,

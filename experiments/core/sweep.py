@@ -341,13 +341,9 @@ def chosen_figures(results: Sequence[Mapping[str, Any]], wanted: Sequence[str]) 
 
 
 def chart(finished: Sequence[tuple[Mapping[str, str], Mapping[str, Any]]], chosen: Sequence[str]) -> bytes:
-    """Draw a panel for each metric, or each figure without one, over the first option.
+    """Draw a panel for each metric, or each chosen figure without one, over the first option.
 
     A line is an arm, and an arm for each setting of the further options.
-
-    Args:
-      finished: settings and figures of each run.
-      chosen: names of the figures.
     """
     first = next(iter(finished[0][0]))
     listed = list(dict.fromkeys(settings[first] for settings, _ in finished))

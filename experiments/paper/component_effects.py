@@ -14,7 +14,7 @@ from experiments.core.text import bounds, interval, number
 from experiments.paper.failure_modes import ArmMeasurements, diagnose, training_history
 from experiments.study.ablation import Ablation, run_ablation
 from experiments.study.baselines import baselines
-from experiments.study.estimates import RESAMPLES, estimate
+from experiments.study.estimates import RESAMPLES, SeedScores, estimate
 from experiments.study.scores import Scored, score
 from experiments.study.study import Study, StudyConfig
 from touchr1_jax.bench.metrics import Scores, mean_accuracy
@@ -37,9 +37,6 @@ LEVEL = 0.05
 
 SignVerdict = Literal["reproduced", "opposite", "undecided", "not in the paper"]
 
-SeedScores = Sequence[Mapping[str, Scores]]
-"""Metric → scores, of every seed."""
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LadderMetric:
@@ -60,14 +57,10 @@ LADDER_METRICS: tuple[LadderMetric, ...] = (
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ComponentStep:
-    """One arm against another.
+    """`arm`, which has a component, against another, and the paper's change in the columns of `LADDER_METRICS`.
 
-    Attributes:
-      arm, against: `arm` has the component, `against` does not.
-      component: its name.
-      published: the paper's change in the columns of `LADDER_METRICS`; `None` where it has no such row.
-      omission: search the run of `against` for failures whatever comes out; else that of `arm`, and only where the
-        paper's sign does not come out.
+    With `omission` the run of `against` is searched for failures whatever comes out; else that of `arm`, and only where
+    the paper's sign does not come out.
     """
 
     arm: str
@@ -123,10 +116,7 @@ def component_effects(
 ) -> tuple[ComponentEffect, ...]:
     """Every step in every metric of the ladder that both of its arms have.
 
-    Args:
-      steps: comparisons.
-      rows: arm → seeds; an arm of one seed, a baseline, is compared with every seed of the other.
-      objects: [N], the object of each question.
+    An arm of one seed, a baseline, is compared with every seed of the other; `objects` [N] is that of each question.
 
     Raises:
       ValueError: two arms of different numbers of seeds, or fewer than two seeds.
@@ -169,12 +159,9 @@ def _effect(
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ComponentComparison:
-    """The rows of a ladder and what its steps change.
+    """The rows of a ladder, `FOUR` among their metrics, and what its steps change; a single seed has no effects.
 
-    Attributes:
-      estimates: row → metric of all policies, variants and baselines, `FOUR` among them.
-      effects: differences of the steps; none with a single seed.
-      failures: known failures that show in the runs behind an effect.
+    `failures` are those that show in the runs behind an effect.
     """
 
     estimates: Mapping[str, Mapping[str, Estimate]]

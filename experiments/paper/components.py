@@ -47,14 +47,7 @@ class ComponentArm:
 
 @dataclasses.dataclass(frozen=True)
 class Component:
-    """One component of the objective.
-
-    Attributes:
-      name: what is added or left out.
-      row: of the paper's ladder, the first that has the component; `None` where no row has it.
-      added: the ladder up to this component.
-      omitted: the full objective without it.
-    """
+    """One component: the paper's first row that has it, the ladder up to it, and the full objective without it."""
 
     name: str
     row: str | None

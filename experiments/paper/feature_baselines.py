@@ -69,11 +69,7 @@ class PredictedLevels:
 
 
 def other_objects(objects: np.ndarray, seed: int) -> Int[np.ndarray, "n"]:
-    """For every contact the position of a random contact of another object; `objects` [n] is that of each contact.
-
-    Raises:
-      DataError: there is only one object.
-    """
+    """For every contact the position of a random contact of another object; `objects` [n] is that of each contact."""
     names, index = np.unique(objects, return_inverse=True)
     if len(names) < 2:
         raise DataError(f"objects holds only {names.tolist()}: another object's touch needs two; use more contacts")
@@ -150,13 +146,7 @@ def nearest(
 
         d² = mean over streams that both have of mean_D ((x − x′)/σ)²
 
-    Args:
-      known, asked: training contacts, and those to answer for.
-      levels: K of each attribute.
-      neighbours: k; fewer where fewer are annotated.
-
-    Raises:
-      ValueError: an attribute that no training contact is annotated for.
+    `levels` are K of each attribute; there are fewer neighbours where fewer contacts are annotated.
     """
     distance = _distances(known.features, asked)
     out = np.zeros((len(asked.x), len(levels)), int)

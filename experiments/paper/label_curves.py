@@ -8,8 +8,6 @@ import numpy as np
 from experiments.core.charts import Panel, draw, estimates
 from experiments.core.results import Cell, Comparison, Estimate, Table, named_table
 from experiments.core.text import bounds, interval
-from experiments.study.estimates import compare_over_objects, compare_over_seeds
-from touchr1_jax.bench.metrics import Scores
 
 Method = Literal["sft", "two_phases", "grpo", "agreement", "physics"]
 METHODS: tuple[Method, ...] = ("sft", "two_phases", "grpo", "agreement", "physics")
@@ -27,24 +25,6 @@ def compared_pairs(count: int) -> list[tuple[str, str]]:
     of_methods = [(f"{a}-{count}-{e}", f"{b}-{count}-{e}") for e in (RANDOM, PRETRAINED) for a, b in before.items()]
     of_encoders = [(f"{m}-{count}-{PRETRAINED}", f"{m}-{count}-{RANDOM}") for m in ("sft", "two_phases")]
     return of_methods + of_encoders
-
-
-def compare(
-    scored: Mapping[str, Sequence[Mapping[str, Scores]]],
-    rows: Mapping[str, Mapping[str, Estimate]],
-    a: str,
-    b: str,
-    objects: np.ndarray,
-) -> list[Comparison]:
-    """One policy against another, over objects and, where there are several, over seeds."""
-    found = []
-    for metric in COMPARED:
-        if metric in rows[a] and metric in rows[b]:
-            of_a, of_b = ([one[metric] for one in scored[name]] for name in (a, b))
-            found.append(compare_over_objects(metric, a, b, of_a, of_b, objects))
-            if len(scored[a]) > 1:
-                found.append(compare_over_seeds(metric, a, b, rows[a][metric], rows[b][metric]))
-    return found
 
 
 def verdict(comparisons: Sequence[Comparison], counts: Sequence[int]) -> tuple[str, ...]:

@@ -22,15 +22,7 @@ LEAST_LOAD_N = 0.5
 
 
 def agreed_levels(evaluation: Evaluation, label: Int[np.ndarray, "n A"]) -> Int[np.ndarray, "n A"]:
-    """The level of each property that at least `AGREEING` of the shown sensors conclude alone, −1 where there is none.
-
-    Args:
-      evaluation: answers with each stream alone about n contacts.
-      label: gives the shape.
-
-    Raises:
-      ValueError: answers without single streams.
-    """
+    """The level of each property that `AGREEING` of the shown sensors conclude alone, −1 without one; as `label`."""
     if evaluation.alone is None:
         raise ValueError("evaluation.alone is None: agreement needs the answers of single streams; ask them")
     found = np.full(label.shape, UNKNOWN)

@@ -163,12 +163,8 @@ class SizeTrend:
 def size_trends(rows: SizeRows, costs: Mapping[str, SizeCost], metrics: Sequence[str]) -> tuple[SizeTrend, ...]:
     """Slopes of every policy and metric: for every seed a line m = a + b·log₂ N through its sizes, b over seeds.
 
-    By least squares b = Σ (x − x̄)(m − m₀) / Σ (x − x̄)² with x = log₂ N, exactly 0 where m does not change.
-
-    Args:
-      rows: policy → size → metric; every policy and size has the same seeds, two at least.
-      costs: size → parameters N.
-      metrics: those to look at; one that some size lacks is left out.
+    By least squares b = Σ (x − x̄)(m − m₀) / Σ (x − x̄)² with x = log₂ N, exactly 0 where m does not change.  A metric
+    that some size lacks is left out.
     """
     doublings = np.log2([costs[name].parameters for name in costs])
     away, found = doublings - doublings.mean(), []

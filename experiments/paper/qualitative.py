@@ -27,12 +27,12 @@ from experiments.paper.bench_scores import bench_answers, bench_questions, touch
 from experiments.paper.components import FULL, run_full_model
 from experiments.paper.touch_gain import (
     TouchQuestions,
-    concluded,
     control_answers,
     control_name,
     control_variants,
     touch_questions,
 )
+from experiments.study.answers import concluded
 from experiments.study.examples import rollouts_of
 from experiments.study.paper_numbers import differences_table
 from experiments.study.scores import PUBLISHED, score_study, study_results
@@ -93,14 +93,7 @@ class Conclusions:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class AnswerCase:
-    """A kind of answer.
-
-    Attributes:
-      title: what happens.
-      rows: bool [N], the answers of this kind.
-      among: bool [N], the questions that could have been of this kind.
-      paper: the paper's example of it, if any.
-    """
+    """A kind of answer: which are of it, which of the questions could have been, and the paper's example."""
 
     title: str
     rows: Bool[np.ndarray, "N"]
@@ -179,13 +172,7 @@ def first_of(rows: Bool[np.ndarray, "N"], objects: np.ndarray, count: int) -> li
 def item_examples(
     asks: Sequence[Ask], answers: Mapping[str, tuple[int, ...]], places: Mapping[Touch, int], full: Evaluation
 ) -> Iterator[tuple[str, list[int]]]:
-    """Of each of `SHOWN_KINDS` the first item answered right and the first wrong: heading, indices in `full`.
-
-    Args:
-      asks, answers: the bench's items, and id → the full model's answer.
-      places: touch → contact, as `full.contact` counts.
-      full: answers about single touches.
-    """
+    """Of each of `SHOWN_KINDS` the first item answered right and the first wrong: heading, indices in `full`."""
     index = {(int(c), int(a)): n for n, (c, a) in enumerate(zip(full.contact, full.attribute, strict=True))}
     for kind in SHOWN_KINDS:
         for wanted in (True, False):

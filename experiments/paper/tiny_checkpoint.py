@@ -90,10 +90,7 @@ VISION_FIELDS = {
 def write_tiny(directory: Path, language: Language, system: str = SYSTEM, decoder: DecoderConfig = SMALLEST) -> None:
     """Write config, tokenizer, template, picture settings and drawn weights in bfloat16.
 
-    Args:
-      directory: created if missing.
-      language, system: answers and text that the tokenizer is trained on, so that they are short.
-      decoder: shape of the decoder; its vocabulary is `ROWS`.
+    The tokenizer is trained on the language's answers and the system's text, so that they are short.
     """
     directory.mkdir(parents=True, exist_ok=True)
     library = trained_tokenizer(language, system)
@@ -189,13 +186,7 @@ TEACHING_OPTIMIZER = OptimizerConfig(learning_rate=1e-5, lr_scale=300.0)
 
 
 def teach(directory: Path, steps: int, context: Context, batch_size: int = TEACHING_BATCH) -> None:
-    """Train the decoder of a checkpoint on drawn answers, and write its weights back in bfloat16.
-
-    Args:
-      directory: as `write_tiny` makes it; its weights are replaced, if there are any steps.
-      steps, batch_size: of training, logged under `STAGE`.
-      context: the run.
-    """
+    """Train the decoder of a checkpoint on drawn answers, and write its weights back in bfloat16."""
     if not steps:
         return
     found = load_checkpoint(directory, jnp.float32)

@@ -73,15 +73,9 @@ def intervals(answer: np.ndarray, label: np.ndarray, objects: np.ndarray) -> dic
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CrossValidation:
-    """A partition of labelled videos into folds, on which policies and probes are compared.
+    """A partition of labelled videos into folds by object, on which policies and probes are compared.
 
-    Attributes:
-      config: the policy.
-      videos: labelled videos.
-      auxiliary: scenes and unlabelled videos.
-      fold: of each video, int [n]; all videos of an object are in one.
-      seed: of the partition, and of what is trained on it.
-      context: keeps finished folds, log and times.
+    `seed` is that of the partition and of what is trained on it; `context` keeps finished folds, log and times.
     """
 
     config: LearnConfig

@@ -74,13 +74,9 @@ class AuxiliaryData:
 
 
 def describe_source(source: Path, frames: int, context: Context, objects: int | None = None) -> DescribedVideos:
-    """Describe the videos of a folder that holds labels.json and videos/.
+    """Describe so many frames in contact of the videos of a folder that holds labels.json and videos/.
 
-    Args:
-      source: the folder.
-      frames: frames in contact that are described of each video.
-      context: its cache keeps the descriptions.
-      objects: how many labelled objects to take, the first of the table; `None` takes all, unlabelled ones too.
+    `objects` takes so many labelled ones, the first of the table; `None` takes all, unlabelled ones too.
 
     Raises:
       ImportSourceError: as `read_labels`, a ratings.json that is not as described, or not one readable video.
@@ -130,11 +126,7 @@ def videos_of(places: Sequence[Path]) -> list[Path]:
 
 
 def describe_files(files: Sequence[Path], frames: int, context: Context) -> DescribedVideos:
-    """Describe videos without labels.
-
-    Raises:
-      ImportSourceError: not one that can be read.
-    """
+    """Describe videos without labels."""
     unknown = np.full((len(files), len(LANGUAGE.attributes)), -1, np.int32)
     return _describe_files(files, np.array([p.name for p in files]), unknown, frames, context)
 

@@ -79,12 +79,7 @@ def learn(
 ) -> TrainedEnsemble:
     """Train every member on labelled videos.
 
-    Args:
-      config, training, auxiliary: the ensemble, its labelled videos, scenes and unlabelled videos.
-      seed: of members and folds; member m has 1000 · seed + m, but its training on made-up evidence does not depend
-        on it.
-      context: keeps log, times and checkpoints.
-      stage: name of the stage; training on made-up evidence is `reading/…`, GRPO `grpo/…`.
+    Member m has seed 1000 · seed + m, on which its training on made-up evidence, stage `reading/…`, does not depend.
     """
     policy, seeds = description_policy(config.shape), [1000 * seed + m for m in range(config.members)]
     with context.timed(stage):
@@ -131,9 +126,7 @@ def answer_log_probs(
 ) -> Float[np.ndarray, "n 27"]:
     """Log-probabilities of every conclusion about objects, known or not; levels of the videos are ignored.
 
-    Args:
-      trained, videos: the ensemble, and the videos that it reads.
-      asked: rows of the videos that each prompt holds; by default a prompt for each video.
+    `asked` are the rows of the videos that each prompt holds; by default a prompt for each video.
     """
     config = trained.config
     p = ProbedVideos(trained.training, trained.auxiliary, videos, config.evidence).evidence()
@@ -196,11 +189,7 @@ def identity(config: LearnConfig) -> str:
 
 
 def load(path: Path, config: LearnConfig) -> TrainedEnsemble:
-    """The ensemble that `save` published.
-
-    Raises:
-      ImportSourceError: no such file, or a policy of another configuration.
-    """
+    """The ensemble that `save` published, of the same configuration."""
     if not path.is_file():
         raise ImportSourceError(f"policy is {path}: no such file; train one, or name a run's policy.npz")
     arrays = load_arrays(path)

@@ -69,13 +69,9 @@ def cached(
     context: Context,
     stage: str,
 ) -> Params:
-    """The result of `train`, from the cache where an experiment already made it.
+    """The result of `train`, which logs under `stage`, from the cache where an experiment already made it.
 
-    Args:
-      kind: stage of training, which decides the source that counts.
-      values, arrays: everything else that the result depends on; arrays may be nested.
-      train: trains and logs under `stage`.
-      context, stage: of the run.
+    `kind` decides the source that counts; values and nested arrays are everything else that the result depends on.
     """
     digest = fingerprint(values, arrays, source_digest(LATER if kind == "sft" else NEVER))
     path = context.cache_dir / kind / f"{digest}.npz"
@@ -128,11 +124,7 @@ def _publish(path: Path, params: Params, lines: list[dict[str, Any]]) -> None:
 
 
 def read_policy(path: Path) -> tuple[Params, list[dict[str, Any]]]:
-    """Parameters of a policy in the cache, and the lines that its training logged.
-
-    Raises:
-      ValueError, KeyError: the file is damaged.
-    """
+    """Parameters of a policy in the cache, and the lines that its training logged; errors are those of `DAMAGED`."""
     arrays = load_arrays(path)
     lines = json.loads(arrays.pop(_LINES).tobytes())
     return traverse_util.unflatten_dict({name: jnp.asarray(x) for name, x in arrays.items()}, sep="/"), lines

@@ -28,14 +28,10 @@ Words = Mapping[str, Sequence[str]]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LevelAnswers:
-    """Answers of one policy, its seeds one after the other.
+    """Answers of one policy, its seeds one after the other: levels and labels int [N, A], objects [N].
 
-    Attributes:
-      answer: int [N, A], `BOTTOM` where the answer could not be parsed.
-      label: int [N, A], `BOTTOM` where the question does not ask for the attribute.
-      objects: [N], the object of each question.
-      agree: int [N, A], number of sensors that, given alone, lead to the answer given by all together; `None` if not
-        measured.
+    `BOTTOM` marks answers that could not be parsed and attributes that were not asked for; `agree` [N, A] counts the
+    sensors that, given alone, lead to the answer given by all together.
     """
 
     answer: np.ndarray
@@ -156,11 +152,7 @@ def agreement_chart(rows: Mapping[str, LevelAnswers]) -> bytes:
 
 
 def accuracy_by_agreement(answers: LevelAnswers) -> tuple[list[int], list[Interval], np.ndarray]:
-    """For each number of agreeing sensors: the share of right answers with its interval, and its share of all answers.
-
-    Raises:
-      ValueError: no sensor was given alone.
-    """
+    """For each number of agreeing sensors: share of right answers with its interval, and its share of all answers."""
     if answers.agree is None:
         raise ValueError("agree is None: needs answers from single sensors; ask with each sensor alone")
     parsed = (answers.label != BOTTOM) & (answers.answer != BOTTOM)

@@ -38,14 +38,7 @@ Train = Callable[[StudyPart, Context], None]
 def train_parts(
     train: Train, parts: Sequence[StudyPart], values: Mapping[str, Any], share: bool, context: Context
 ) -> None:
-    """Have workers train the policies of a study that are not in the cache yet.
-
-    Args:
-      train: trains one of them into the cache; pickled.
-      parts: the policies.
-      values: everything that they depend on.
-      share: of the study's configuration.
-      context: the run, which says where they are trained.
+    """Have workers train the policies of a study that are not in the cache yet; they depend on `values` alone.
 
     Raises:
       DataError: the study takes no policies from the cache.

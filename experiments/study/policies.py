@@ -130,11 +130,7 @@ def is_policy(name: str, runs_dir: Path) -> bool:
 
 
 def run_policy(name: str, runs_dir: Path) -> Path | None:
-    """The folder of a policy of a run; `None` where the name is that of no run.
-
-    Raises:
-      PolicyError: a run without this policy.
-    """
+    """The folder of a policy of a run, which must have it; `None` where the name is that of no run."""
     parts = Path(name).parts
     for count in range(len(parts), max(len(parts) - 3, 0), -1):
         try:

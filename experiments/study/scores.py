@@ -8,7 +8,7 @@ import numpy as np
 
 from experiments.core.results import Estimate, Results
 from experiments.study.baselines import baselines
-from experiments.study.estimates import estimate
+from experiments.study.estimates import estimate_rows
 from experiments.study.stages import Weights
 from experiments.study.study import SFT, Study
 from experiments.study.training import TrainingConfig
@@ -44,10 +44,7 @@ def score_study(study: Study) -> Scored:
     answers = {**study.answers, **{name: [answers] for name, answers in baselines(study).items()}}
     rows = {name: [score(study, one) for one in seeds] for name, seeds in answers.items()}
     objects = study.data.object_ids[study.data.parts["test"]][study.answers[SFT][0].contact]
-    estimates = {
-        name: {metric: estimate([s[metric] for s in seeds], objects) for metric in seeds[0]}
-        for name, seeds in rows.items()
-    }
+    estimates = estimate_rows(rows, objects)
     arms = {name: estimates.pop(name) for name in study.policies}
     return Scored(rows=rows, objects=objects, arms=arms, baselines=estimates)
 

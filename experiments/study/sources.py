@@ -63,13 +63,7 @@ def prepare_records(config: SourceConfig, context: Context) -> Path:
 
 
 def odd_contacts(config: SourceConfig, path: Path, context: Context) -> tuple[int, ...]:
-    """Contacts of recordings of which a sequence teaches nothing about touch, listed by reason; none of generated ones.
-
-    Args:
-      config: of the experiment; `drop_odd` decides what the list says.
-      path: directory of the records.
-      context: the run.
-    """
+    """Contacts of recordings of which a sequence teaches nothing about touch, printed by reason; none of scenes."""
     if config.data == "generated":
         return ()
     store, reasons = RecordStore(path), dict[str, dict[int, str]]()

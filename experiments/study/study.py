@@ -202,12 +202,9 @@ def train_study(
     tactile: Params | None = None,
     share: bool = False,
 ) -> Study:
-    """Train every arm of every seed and evaluate every policy, with data and policy at hand.
+    """Train every arm of every seed and evaluate every policy, with data and policy at hand; see `run_study`.
 
-    Args:
-      config, data, policy, arms, context, algorithms, variants: as in `run_study`, which checks them.
-      tactile: parameters of the tactile encoder that SFT starts from; `None` starts from fresh ones.
-      share: take policies from the cache.
+    `tactile` are parameters of the tactile encoder that SFT starts from; with `share` policies come from the cache.
     """
     probed = probe_features(data, context)
     study = _shared(config, data, policy, arms, algorithms, probed, context)

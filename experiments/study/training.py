@@ -134,11 +134,7 @@ class TrainingConfig(SourceConfig):
 
 
 def require_derived(field: str, value: int) -> None:
-    """Refuse a number of the model that the data or the language determine.
-
-    Raises:
-      ValueError: it is not 0.
-    """
+    """Refuse a number of the model that the data or the language determine."""
     if value:
         raise ValueError(f"model.{field} is {value}: must be 0, the data and the language determine it; leave it out")
 
