@@ -6,6 +6,7 @@ could simply be read.
 
 import dataclasses
 import functools
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import flax.linen as nn
@@ -17,13 +18,36 @@ from flax import struct
 from jaxtyping import Array, Float, Int, UInt8
 
 from experiments.active.contacts import LEVELS, PROPERTIES, ContactBank
-from experiments.active.feed import DrawnFeed
 from experiments.core.context import Context
 from experiments.core.loops import run_loop
 from touchr1_jax.models.frame_statistics import scaled_statistics
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
 from touchr1_jax.types import Params
+
+
+class DrawnFeed:
+    """Batches made by a function of a generator of random numbers; batch t depends on the seed and t alone."""
+
+    def __init__(self, make: Callable[[np.random.Generator], Any], seed: int) -> None:
+        self._make, self._seed, self._step = make, seed, 0
+
+    def __iter__(self) -> Iterator[Any]:
+        return self
+
+    def __next__(self) -> Any:
+        rng = np.random.default_rng([self._seed, self._step])
+        self._step += 1
+        return self._make(rng)
+
+    def get_state(self) -> int:
+        """Number of the next batch."""
+        return self._step
+
+    def set_state(self, state: int) -> None:
+        """Go to a batch."""
+        self._step = state
+
 
 FAR = 5.0
 """Standard deviations beyond which statistics are cut off."""

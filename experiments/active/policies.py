@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from experiments.active.feed import DrawnFeed
+from experiments.active.encoder import DrawnFeed
 from experiments.active.plans import NO_CHOICE, Answer, Played
 from experiments.core.context import Context
 from experiments.core.loops import stage_hooks

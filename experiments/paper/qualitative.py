@@ -77,21 +77,6 @@ class QualitativeConfig:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Conclusions:
-    """Levels that policies of one seed concluded for the same N questions, −1 for ⊥: each int [N].
-
-    `swapped` is the full model with another object's touch, `perceived` [N, S] the level that it perceives by each
-    sensor, −1 where a sensor is absent.
-    """
-
-    full: Int[np.ndarray, "N"]
-    sft: Int[np.ndarray, "N"]
-    blind: Int[np.ndarray, "N"]
-    swapped: Int[np.ndarray, "N"]
-    perceived: Int[np.ndarray, "N S"]
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class AnswerCase:
     """A kind of answer: which are of it, which of the questions could have been, and the paper's example."""
 
@@ -114,13 +99,11 @@ def run(config: QualitativeConfig, context: Context) -> Results:
     slots = np.asarray(full.parsed.perceive)[np.arange(len(full.contact)), :, full.attribute]
     cases = answer_cases(
         questions,
-        Conclusions(
-            full=concluded(full),
-            sft=concluded(first[SFT]),
-            blind=concluded(first[BLIND]),
-            swapped=concluded(first[control_name(FULL, "swapped")]),
-            perceived=np.where(full.streams, slots, BOTTOM),
-        ),
+        full=concluded(full),
+        sft=concluded(first[SFT]),
+        blind=concluded(first[BLIND]),
+        swapped=concluded(first[control_name(FULL, "swapped")]),
+        perceived=np.where(full.streams, slots, BOTTOM),
     )
     asks = bench_questions(study.data, config.quota, context)
     chosen = [(case.title, first_of(case.rows, questions.objects, SHOWN)) for case in cases]
@@ -136,28 +119,40 @@ def run(config: QualitativeConfig, context: Context) -> Results:
     )
 
 
-def answer_cases(questions: TouchQuestions, answers: Conclusions) -> tuple[AnswerCase, ...]:
-    """The kinds of answers that are shown."""
-    right, read = answers.full == questions.label, answers.full != BOTTOM
+def answer_cases(
+    questions: TouchQuestions,
+    *,
+    full: Int[np.ndarray, "N"],
+    sft: Int[np.ndarray, "N"],
+    blind: Int[np.ndarray, "N"],
+    swapped: Int[np.ndarray, "N"],
+    perceived: Int[np.ndarray, "N S"],
+) -> tuple[AnswerCase, ...]:
+    """The kinds of answers that are shown, from the levels that policies of one seed concluded, −1 for ⊥.
+
+    `swapped` is the full model with another object's touch, `perceived` the level that it perceives by each sensor, −1
+    where a sensor is absent.
+    """
+    right, read = full == questions.label, full != BOTTOM
     material = questions.of("material")
-    misled = questions.looks_like_another & (answers.blind != questions.label) & (answers.blind != BOTTOM)
-    known = answers.perceived != BOTTOM
-    least = np.where(known, answers.perceived, np.iinfo(answers.perceived.dtype).max).min(1)
-    split = questions.ordinal & (known.sum(1) > 1) & (least < answers.perceived.max(1))
-    two_off = read & (np.abs(answers.full - questions.label) > 1)
+    misled = questions.looks_like_another & (blind != questions.label) & (blind != BOTTOM)
+    known = perceived != BOTTOM
+    least = np.where(known, perceived, np.iinfo(perceived.dtype).max).min(1)
+    split = questions.ordinal & (known.sum(1) > 1) & (least < perceived.max(1))
+    two_off = read & (np.abs(full - questions.label) > 1)
     case = lambda title, rows, among, **paper: AnswerCase(title=title, rows=rows & among, among=among, **paper)
     return (
-        case("Hardness is right, and wrong with another object's touch", right & (answers.swapped != questions.label),
+        case("Hardness is right, and wrong with another object's touch", right & (swapped != questions.label),
              questions.of("hardness"), paper="hardness, estimated from touch"),
         case("The picture deceives about the material, touch overrules it", right, misled & material,
              paper="a conflict about the material, resolved"),
         case("The picture deceives about a level, touch overrules it", right, misled & ~material),
-        case("The picture deceives and is followed", answers.full == answers.blind, misled),
+        case("The picture deceives and is followed", full == blind, misled),
         case("Sensors disagree, the conclusion is right", right, split),
         case("Sensors disagree, the conclusion is wrong", ~right, split),
         case("Two levels off", two_off, questions.ordinal),
-        case("GRPO corrects what SFT had wrong", right, answers.sft != questions.label),
-        case("GRPO spoils what SFT had right", ~right, answers.sft == questions.label),
+        case("GRPO corrects what SFT had wrong", right, sft != questions.label),
+        case("GRPO spoils what SFT had right", ~right, sft == questions.label),
         case("Cannot be read", ~read, np.ones_like(read)),
     )  # fmt: skip
 
