@@ -36,8 +36,7 @@ from touchr1_jax.training.optimizer import OptimizerConfig
 from touchr1_jax.training.train_sft import SFTConfig
 from touchr1_jax.types import Params
 
-EVERY_TOUCH = "every_touch"
-"""The control that makes every contact; of the first seed alone."""
+EVERY_TOUCH = "every_touch"  # the control that makes every contact; of the first seed alone
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

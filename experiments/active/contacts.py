@@ -34,8 +34,7 @@ PROPERTIES = ("hardness", "roughness", "protrusion", "elasticity", "friction")
 
 LEVELS = 3
 
-VERSION = 1
-"""Raised whenever the same configuration would give other contacts."""
+VERSION = 1  # raised whenever the same configuration would give other contacts
 
 _OBJECTS_A_FILE = 20
 

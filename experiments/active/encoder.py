@@ -49,8 +49,7 @@ class DrawnFeed:
         self._step = state
 
 
-FAR = 5.0
-"""Standard deviations beyond which statistics are cut off."""
+FAR = 5.0  # standard deviations beyond which statistics are cut off
 
 _CONSTANT = 1e-4  # spread below which a statistic of a choice says nothing
 

@@ -27,8 +27,7 @@ from experiments.study.estimates import compare_over_objects, compare_over_seeds
 from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.bench.statistics import Interval
 
-METRIC = "acc"
-"""Mean of the accuracy over the five properties."""
+METRIC = "acc"  # mean of the accuracy over the five properties
 
 RULES = ("random", "best_press", "best_fixed", "by_question")
 EQUAL = "at_equal_seconds"

@@ -24,8 +24,7 @@ PLANS = (RANDOM, FIXED, BY_QUESTION, BY_BELIEF)
 BELIEFS = 6
 """Classes of beliefs that a tree distinguishes: the likeliest of three levels, held with more or less than `SURE`."""
 
-SURE = 0.6
-"""Probability of the likeliest level from which a belief counts as sure."""
+SURE = 0.6  # probability of the likeliest level from which a belief counts as sure
 
 _DRAWS = 400  # random sequences that stand for all
 

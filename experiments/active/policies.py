@@ -26,8 +26,7 @@ from touchr1_jax.training.sft import SFTBatch
 from touchr1_jax.training.train_sft import SFTConfig, train_sft
 from touchr1_jax.types import Params
 
-ROWS = 256
-"""Trajectories that are scored at once."""
+ROWS = 256  # trajectories that are scored at once
 
 
 @dataclasses.dataclass(frozen=True)

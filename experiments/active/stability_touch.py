@@ -32,11 +32,8 @@ from experiments.core.runner import Experiment
 from experiments.study.alarm_log import ALARM
 from touchr1_jax.models.active_policy import ActivePolicy
 
-ENOUGH = 4
-"""Questions of five whose motion a seed must find."""
-
-SHARE = 80.0
-"""Per cent of the seeds that must find so many."""
+ENOUGH = 4  # questions of five whose motion a seed must find
+SHARE = 80.0  # per cent of the seeds that must find so many
 
 NAME = "chosen"
 

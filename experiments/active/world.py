@@ -97,8 +97,7 @@ good.  The encoders learn from the first two, each object read by one that did n
 
 READERS = "readers"  # prefix of their arrays
 
-VERSION = 3
-"""Raised whenever the same configuration would give other tokens or beliefs."""
+VERSION = 3  # raised whenever the same configuration would give other tokens or beliefs
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

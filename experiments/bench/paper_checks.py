@@ -16,16 +16,14 @@ from touchr1_jax.bench.statistics import wilson_interval
 
 Verdict = Literal["contradiction", "not given", "unsupported", "holds"]
 
-MainTable = Mapping[str, tuple[paper.Row, float]]
-"""Model → the nine columns of the main table, and Avg."""
+MainTable = Mapping[str, tuple[paper.Row, float]]  # model → the nine columns of the main table, and Avg
 
 OURS = "Touch-R1-7B"
 
 SHARE_ROUNDING, LEVEL_ROUNDING = 0.05, 0.005
 """Half of the last digit of a percentage, and of OMAE and ρ."""
 
-SOLVER_ERROR = 1e-6
-"""Points; a smaller miss counts as none."""
+SOLVER_ERROR = 1e-6  # Points; a smaller miss counts as none
 
 SAME_MODELS = {"Qwen2.5-VL-7B": "Qwen2.5-VL-7B", OURS: "Touch-R1"}
 """Models of the main table → their names in the ablation tables."""

@@ -13,8 +13,7 @@ from touchr1_jax.bench.items import read_items
 from touchr1_jax.bench.json_lines import read_lines
 from touchr1_jax.bench.questions.answers import average_line, metric_rows, parsed_share, read_answers
 
-SCORES = "scores"
-"""Folder of the cache that holds them."""
+SCORES = "scores"  # folder of the cache that holds them
 
 
 def score_units(

@@ -50,8 +50,7 @@ MOTIONS = ("slide_x", "hold")
 FUSED, WITH_FORCE = "all sensors", "all sensors and force"
 FORCE, SHAPE, PRIOR = "force alone", "true shape", "commonest"
 
-Scored = Mapping[str, Mapping[str, Interval]]
-"""Predictor → task, and "average"."""
+Scored = Mapping[str, Mapping[str, Interval]]  # predictor → task, and "average"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -19,11 +19,8 @@ The most important is the first."""
 
 GRAVITY = get_args(Verdict)
 
-ABSENT_IN = "only in"
-"""Begins the verdict on a figure that some runs lack."""
-
-CHANCE = 0.05
-"""Rate at which a 95 % interval of no difference excludes 0."""
+ABSENT_IN = "only in"  # begins the verdict on a figure that some runs lack
+CHANCE = 0.05  # rate at which a 95 % interval of no difference excludes 0
 
 
 class ComparisonError(ValueError):

@@ -12,8 +12,7 @@ from experiments.core.look import MARKERS, SHARED, colours
 from experiments.core.results import Estimate
 from touchr1_jax.bench.metrics import METRICS
 
-MOST_POINTS = 160
-"""Of a drawn line: a panel is as many points wide."""
+MOST_POINTS = 160  # of a drawn line: a panel is as many points wide
 
 POINTS_OF_CHART = 25_000
 """Of all lines of a chart, so that its SVG stays under a megabyte; a line keeps at least `FEWEST_POINTS`."""
@@ -32,8 +31,7 @@ WORDS = {
 }
 """Scalar → its name in a chart, where that of the log says too little."""
 
-Curve = tuple[np.ndarray, np.ndarray]
-"""Steps and values of one logged scalar of one stage."""
+Curve = tuple[np.ndarray, np.ndarray]  # steps and values of one logged scalar of one stage
 
 
 def curves_by_phase(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[tuple[str, str], Curve]]]:

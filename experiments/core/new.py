@@ -14,11 +14,8 @@ from experiments.core.artifacts import write_text
 DICTIONARY = Path("touchr1_jax/rewards/__init__.py")
 """The file with an import and an entry for every reward."""
 
-EXAMPLES = Path("tests/touchr1_jax/rewards/examples.py")
-"""Answers and targets of the tests of rewards."""
-
-_MAKER = "make_rewards"
-"""The function that returns the dictionary."""
+EXAMPLES = Path("tests/touchr1_jax/rewards/examples.py")  # answers and targets of the tests of rewards
+_MAKER = "make_rewards"  # the function that returns the dictionary
 
 _ANSWER = "<perceive> xense soft </perceive> <compare> soft </compare> <conclude> soft </conclude>"
 """An answer to try a reward on."""

@@ -21,8 +21,7 @@ from rich.text import Text
 
 from experiments.core.text import duration
 
-PLAIN_EVERY_S = 10.0
-"""Seconds between two plain lines."""
+PLAIN_EVERY_S = 10.0  # seconds between two plain lines
 
 
 class Advance(Protocol):

@@ -28,8 +28,7 @@ RECORDED = Path("experiments/recorded")
 
 BEGIN, END = "<!-- results: `python -m experiments.core.recorded fill` writes this table -->", "<!-- /results -->"
 
-TABLE = "table.md"
-"""File in it with the rows: subject, figures, experiment."""
+TABLE = "table.md"  # file in it with the rows: subject, figures, experiment
 
 _ABSOLUTE = re.compile(r"(?:/[\w.+ -]+){2,}/?|[A-Za-z]:\\\S+")
 _FIGURE = re.compile(r"\{([^{}|]+)\|([^{}|]+)\}")

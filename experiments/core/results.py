@@ -11,14 +11,12 @@ from experiments.core.artifacts import jsonable
 from experiments.core.errors import require
 from touchr1_jax.bench.scoring import REPORTED
 
-SETTINGS = ("preset", "lr_scale")
-"""Settings without which no report can be read."""
+SETTINGS = ("preset", "lr_scale")  # settings without which no report can be read
 
 Slot = tuple[int, int, str]
 """Start, end and segment (`perceive`, `compare` or `conclude`) of a piece of a trace."""
 
-Cell = str | float | int | bool | None
-"""What a table holds; `None` where nothing was measured."""
+Cell = str | float | int | bool | None  # what a table holds; `None` where nothing was measured
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -57,8 +57,7 @@ from touchr1_jax.training.compilation import compilations_kept, compiled_quickly
 from touchr1_jax.training.loop import NonFiniteGradientError
 from touchr1_jax.training.questions import NoLabelsError
 
-EVENTS = "events"
-"""Folder of a run that holds its TensorBoard events."""
+EVENTS = "events"  # folder of a run that holds its TensorBoard events
 
 HELP_ALL = "--help-all"
 
@@ -78,8 +77,7 @@ OF_RUNNER = (
 )
 """Options of every experiment."""
 
-MOST_OPTIONS, MOST_LETTERS = 10, 70
-"""Of short help: options, and letters about a group."""
+MOST_OPTIONS, MOST_LETTERS = 10, 70  # of short help: options, and letters about a group
 
 COMPILED = "compiled"
 """Folder of the cache for compiled programs, which later runs of the same shapes reuse."""

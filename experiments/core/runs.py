@@ -30,11 +30,8 @@ PACKAGES = ("touchr1-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint",
 FIELDS = frozenset({"experiment", "scale", "config", "git", "command"})
 """Fields in `config.json` of a run; that of a model has others."""
 
-UNKNOWN = "unknown"
-"""Commit of code outside a checkout."""
-
-ROOT = Path(__file__).resolve().parents[2]
-"""The checkout of this code, if there is one."""
+UNKNOWN = "unknown"  # commit of code outside a checkout
+ROOT = Path(__file__).resolve().parents[2]  # the checkout of this code, if there is one
 
 
 class RunInUse(RuntimeError):

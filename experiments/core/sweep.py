@@ -34,16 +34,14 @@ from sensors_io.errors import UserError
 from sensors_io.units import HERE, Launcher, LauncherError, UnitsError, WorkUnit, finish
 from touchr1_jax.bench.scoring import REPORTED
 
-FOLDERS = "sweeps"
-"""Folder of the sweeps in the folder of all runs."""
+FOLDERS = "sweeps"  # folder of the sweeps in the folder of all runs
 
 DIGITS = 8  # of a hash in a name
 MOST = 6  # figures of a table whose figures nobody chose
 
 MAIN = ("acc", "avg", "omae")  # metrics of a table of arms whose figures nobody chose
 
-WIDE = 20.0
-"""Largest over smallest value from which on an axis is logarithmic."""
+WIDE = 20.0  # largest over smallest value from which on an axis is logarithmic
 
 NOTE = (
     "Scores are those of test objects.  They say how much a setting matters; a setting that was chosen by them must be "

@@ -30,13 +30,11 @@ from touchr1_jax.bench.scoring import REPORTED, ItemAnswers, score
 from touchr1_jax.bench.statistics import draw_clusters, drawn_means, improvement_interval, stratified_bootstrap_iqm
 from touchr1_jax.training.evaluation import Evaluation
 
-ORDINAL_LEVELS = 3
-"""K of ordinal levels: means of levels over K stay below one level."""
+ORDINAL_LEVELS = 3  # K of ordinal levels: means of levels over K stay below one level
 
 AVERAGE_MEANING = "mean of the nine columns, OMAE as 100(1 − OMAE/2), ρ as 100ρ"
 
-Estimates = Mapping[str, Estimate]
-"""Metric → estimate, of one row of a table."""
+Estimates = Mapping[str, Estimate]  # metric → estimate, of one row of a table
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

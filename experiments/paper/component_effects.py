@@ -27,8 +27,7 @@ FOUR = "four_acc"
 MOST = 0.5
 """Share of seeds in which an alarm fires, of groups that teach nothing, or of entropy that is left: a failure shows."""
 
-POINTS = 2.0
-"""Change of a share, in points, that counts: about the spread between seeds."""
+POINTS = 2.0  # change of a share, in points, that counts: about the spread between seeds
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -114,8 +113,7 @@ def diagnose(
 PRIMARY = {("SFT", FOUR), ("ordinal credit", "omae"), ("consistency", "csc")}
 """Component and metric of the three claims that the paper rests on; all other effects are exploratory."""
 
-LEVEL = 0.05
-"""p-value below which a sign counts."""
+LEVEL = 0.05  # p-value below which a sign counts
 
 SignVerdict = Literal["reproduced", "opposite", "undecided", "not in the paper"]
 

@@ -29,11 +29,8 @@ NEIGHBOURS = 15
 CELLS = 8
 """Cells along a side that fields and pictures are averaged to: about 2 mm each on the widest sensor."""
 
-FINE_PX, COARSE_PX = 1, 4
-"""Distances between the pixels whose difference measures texture."""
-
-TINY = 1e-3
-"""Keeps the logarithm of a flat picture finite; pictures are in 0..1."""
+FINE_PX, COARSE_PX = 1, 4  # distances between the pixels whose difference measures texture
+TINY = 1e-3  # keeps the logarithm of a flat picture finite; pictures are in 0..1
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -12,8 +12,7 @@ from experiments.core.text import bounds, interval
 Method = Literal["sft", "two_phases", "grpo", "agreement", "physics"]
 METHODS: tuple[Method, ...] = ("sft", "two_phases", "grpo", "agreement", "physics")
 
-RANDOM, PRETRAINED = "random", "pretrained"
-"""Encoders that SFT starts from."""
+RANDOM, PRETRAINED = "random", "pretrained"  # encoders that SFT starts from
 
 COMPARED = ("acc", "omae", "mat_acc")
 

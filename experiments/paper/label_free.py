@@ -8,17 +8,13 @@ from sensors_io.pipeline import Contacts
 from sensors_io.schema import ATTRIBUTES, UNKNOWN, Phase, Sequence
 from touchr1_jax.training.evaluation import Evaluation
 
-AGREEING = 0.75
-"""Share of the sensors that must give one level alone."""
+AGREEING = 0.75  # share of the sensors that must give one level alone
 
 BANDS = ((0.0, 0.28), (0.39, 0.61), (0.72, 1.0))
 """Ranks among all contacts that imply the levels of a property with equal shares; between them nothing is implied."""
 
-LEAST_RANKED = 30
-"""Contacts with a measured quantity below which its ranks imply nothing."""
-
-LEAST_LOAD_N = 0.5
-"""Normal force under which friction is not read."""
+LEAST_RANKED = 30  # contacts with a measured quantity below which its ranks imply nothing
+LEAST_LOAD_N = 0.5  # normal force under which friction is not read
 
 
 def agreed_levels(evaluation: Evaluation, label: Int[np.ndarray, "n A"]) -> Int[np.ndarray, "n A"]:

@@ -139,8 +139,7 @@ def timed_programs(study: Study) -> TimedPrograms:
     return TimedPrograms(train=train, answer=answer, questions=len(contact), parameters=parameters)
 
 
-SizeRows = Mapping[str, Mapping[str, Mapping[str, Estimate]]]
-"""Policy → size → metric."""
+SizeRows = Mapping[str, Mapping[str, Mapping[str, Estimate]]]  # policy → size → metric
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

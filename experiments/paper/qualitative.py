@@ -55,8 +55,7 @@ REPLACEMENTS = {
 OTHER_POLICIES = {SFT: "its own touch, before GRPO", BLIND: "nothing, and a policy trained so"}
 """In the same table."""
 
-SHOWN = 2
-"""Answers of each case that are shown, at most."""
+SHOWN = 2  # answers of each case that are shown, at most
 
 SHOWN_KINDS = ("compose", "compare", "order")
 """Kinds of the bench's items whose answer consists of several answers."""

@@ -40,8 +40,7 @@ from touchr1_jax.types import TouchBatch
 
 TEMPLATE = Path(__file__).parent / "chat_template.jinja"
 
-VOCABULARY = 640
-"""Words of the tokenizer; the table has more rows, as Qwen's has."""
+VOCABULARY = 640  # words of the tokenizer; the table has more rows, as Qwen's has
 
 ROWS = 704
 

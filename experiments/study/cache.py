@@ -55,8 +55,7 @@ LATER = (
 USED = ("touchr1_jax/rl/alarms.py", "touchr1_jax/rl/gradient.py", "touchr1_jax/rl/losses.py")
 """Files among `LATER` that SFT and the encoders are built on."""
 
-DAMAGED = (ValueError, KeyError)
-"""Errors of a file of the cache that is not what was written."""
+DAMAGED = (ValueError, KeyError)  # errors of a file of the cache that is not what was written
 
 _LINES = "metrics"  # entry of the file that holds the logged lines as JSON; parameters are named by their path
 

@@ -18,8 +18,7 @@ from touchr1_jax.bench.sampled import DecisionRule, decide
 from touchr1_jax.bench.scoring import REPORTED
 from touchr1_jax.training.evaluation import Evaluation
 
-MIDDLE = 1
-"""Middle one of three ordinal levels."""
+MIDDLE = 1  # middle one of three ordinal levels
 
 
 def against_control(rows: Mapping[str, Mapping[str, Estimate]], arms: Iterable[str]) -> list[Comparison]:

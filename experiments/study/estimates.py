@@ -12,11 +12,8 @@ from touchr1_jax.bench import statistics
 from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.bench.scoring import REPORTED
 
-SeedScores = Sequence[Mapping[str, Scores]]
-"""Metric → scores, of every seed."""
-
-RESAMPLES = 2_000
-"""Of each interval over objects: its ends are then good to a tenth of its width."""
+SeedScores = Sequence[Mapping[str, Scores]]  # metric → scores, of every seed
+RESAMPLES = 2_000  # of each interval over objects: its ends are then good to a tenth of its width
 
 
 def object_interval(values: np.ndarray, objects: np.ndarray, spec: str = ".1f") -> str | None:

@@ -17,17 +17,10 @@ from touchr1_jax.text.language import SEGMENTS
 from touchr1_jax.text.template import QUESTIONS
 from touchr1_jax.training.evaluation import Evaluation, reward_terms
 
-FIELD_PX = 192
-"""Side of a drawn field."""
-
-ARROWS = 12
-"""Arrows along a side of a drawn field."""
-
-SCALE_PX = 58
-"""Width of the scale beside it."""
-
-ARROW_PX = 14.0
-"""Length of the longest arrow: it stays inside its cell."""
+FIELD_PX = 192  # side of a drawn field
+ARROWS = 12  # arrows along a side of a drawn field
+SCALE_PX = 58  # width of the scale beside it
+ARROW_PX = 14.0  # length of the longest arrow: it stays inside its cell
 
 
 def rollout_examples(

@@ -17,13 +17,11 @@ from touchr1_jax.bench.sampled import Votes, calibration_error, majority, pass_a
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
 from touchr1_jax.training.evaluation import Evaluation
 
-RESAMPLES = 1_000
-"""Of each interval over objects; its ends are then accurate to a tenth of its width."""
+RESAMPLES = 1_000  # of each interval over objects; its ends are then accurate to a tenth of its width
 
 _COLUMNS = [ATTRIBUTES.index(name) for name in ORDINAL]
 
-Words = Mapping[str, Sequence[str]]
-"""Attribute → names of its levels, in order."""
+Words = Mapping[str, Sequence[str]]  # attribute → names of its levels, in order
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -23,14 +23,9 @@ from touchr1_jax.models.saved_policy import PolicyError, PolicyInput, SavedPolic
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.types import Params
 
-FIGURES = ("acc", "h_acc", "r_acc", "p_acc", "mat_acc", "omae", "parse_rate")
-"""Metrics of a model card."""
-
-POLICIES = "policies"
-"""Folder of a run with its trained policies."""
-
-SCENES = "scenes"
-"""Note with the configuration of the generated scenes that a policy was trained on."""
+FIGURES = ("acc", "h_acc", "r_acc", "p_acc", "mat_acc", "omae", "parse_rate")  # metrics of a model card
+POLICIES = "policies"  # folder of a run with its trained policies
+SCENES = "scenes"  # note with the configuration of the generated scenes that a policy was trained on
 
 ONLY_SCENES = "generated scenes only: pictures of real sensors look different, and answers about them are guesses"
 """Note on the limits of a policy that was trained on generated scenes."""

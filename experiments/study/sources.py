@@ -19,8 +19,7 @@ from sensors_io.scenes.config import SceneConfig, config_hash
 
 Source = Literal["generated", "physiclear", "records"]
 
-MOST_NAMED = 3
-"""Odd contacts that a line names."""
+MOST_NAMED = 3  # odd contacts that a line names
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

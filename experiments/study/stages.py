@@ -26,8 +26,7 @@ from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.train_sft import SFTConfig
 from touchr1_jax.types import Params, StepSample, TouchBatch
 
-Weights = Mapping[str, float]
-"""Reward → weight."""
+Weights = Mapping[str, float]  # reward → weight
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

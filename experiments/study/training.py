@@ -27,8 +27,7 @@ from touchr1_jax.training.train_sft import SFTConfig
 from touchr1_jax.types import Params
 from touchr1_jax.validation import at_least
 
-GRPO_SHARE = 0.35
-"""Share of the training objects that SFT never sees under recipe `paper`."""
+GRPO_SHARE = 0.35  # share of the training objects that SFT never sees under recipe `paper`
 
 GRPO_ATTRIBUTES = ORDINAL
 """Attributes that GRPO asks about under recipe `paper`; the arms may differ in how they pay for the answers."""
