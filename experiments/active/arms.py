@@ -31,7 +31,6 @@ from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.rl.config import GRPOConfig, Norm, Paper
 from touchr1_jax.rl.touch_reward import Prices
 from touchr1_jax.training.exploration import check_exploration, touch_batch_of
-from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import OptimizerConfig
 from touchr1_jax.training.train_sft import SFTConfig
 from touchr1_jax.types import Params
@@ -212,7 +211,7 @@ def reinforced_params(
         arm.budget,
         arm.prices,
         config.dropout,
-        LoopConfig(steps=config.steps, save_every=max(1, config.steps)),
+        config.steps,
         context,
         f"grpo/{name}/{seed}",
         seed,

@@ -132,7 +132,7 @@ def reinforce(
     budget: int,
     prices: Prices,
     dropout: float,
-    loop: LoopConfig,
+    steps: int,
     context: Context,
     stage: str,
     seed: int,
@@ -142,6 +142,7 @@ def reinforce(
     The length of a step follows from the budget; a sensor or a motion drops out of a prompt with probability `dropout`.
     """
     config = dataclasses.replace(config, length=policy.tokens(budget))
+    loop = LoopConfig(steps=steps, save_every=max(1, steps))
     feed = ActiveFeed(policy, bank, batch_size=config.drawn, seed=seed, dropout=dropout)
     make_log = functools.partial(alarm_log, rules=ACTIVE_RULES)
     with stage_hooks(context, stage, loop.steps, make_log=make_log) as hooks:

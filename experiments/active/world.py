@@ -1,7 +1,7 @@
 """The world in which a policy chooses: encoded contacts, which objects serve for what, and what probes know."""
 
 import dataclasses
-import io
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -22,11 +22,9 @@ from experiments.active.encoder import (
     train_reader,
 )
 from experiments.active.headroom import Beliefs
-from experiments.core.artifacts import write_bytes
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
 from experiments.study.cache import fingerprint
-from sensors_io.arrays import load_arrays
 from touchr1_jax.rl.environment import TouchBank, TouchChoice
 from touchr1_jax.training.linear_probe import ProbeConfig, group_folds, probe_log_probs, stream_features
 
@@ -146,12 +144,8 @@ def make_world(config: WorldConfig, context: Context) -> TouchWorld:
     with context.timed("contacts"):
         made = generate(contacts, context)
     values = {"world": config, "contacts": contacts_hash(contacts), "probe": PROBE, "version": VERSION}
-    path = context.cache_dir / "touch_bank" / f"{fingerprint(values, {}, '')}.npz"
-    if not path.exists():
-        buffer = io.BytesIO()
-        np.savez(buffer, **_encoded(config, made, parts, context))
-        write_bytes(path, buffer.getvalue())
-    found = load_arrays(path)
+    encode = functools.partial(_encoded, config, made, parts, context)
+    found = context.cached_arrays(f"touch_bank/{fingerprint(values, {}, '')}", encode)
     shape = made.harm.shape
     bank = TouchBank(
         tokens=jnp.asarray(found["tokens"], jnp.float32),

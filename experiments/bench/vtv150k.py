@@ -157,12 +157,6 @@ def predictions(
     }
 
 
-def half_width(share: float, questions: int) -> float:
-    """1.96 √(p (1 − p) / n) in points, of a share in percent over n independent questions."""
-    p = share / 100
-    return 196 * math.sqrt(p * (1 - p) / questions)
-
-
 def verdict(scored: Scored) -> tuple[str, ...]:
     """Touch against force, shape and guessing; and the paper's rows against guessing."""
     average, guess = {name: row["average"] for name, row in scored.items()}, vtv_average(CHANCE)
@@ -215,14 +209,14 @@ MEANINGS: Mapping[str, str] = {
 
 def task_table(counts: Mapping[str, int], scored: Mapping[str, Interval]) -> Table:
     """Meaning, questions and chance of each task, and the interval that the benchmark's size would give its share."""
-    width = f"± of {paper.VTV_ITEMS}"
+    width, deviation = f"± of {paper.VTV_ITEMS}", lambda p: math.sqrt(p * (1 - p) / paper.VTV_ITEMS)
     rows: list[dict[str, Cell]] = [
         {
             "task": task,
             "asks for": MEANINGS[task],
             "questions": counts[task],
             "chance": CHANCE[task],
-            width: half_width(scored[task].mean, paper.VTV_ITEMS),
+            width: 196 * deviation(scored[task].mean / 100),
         }
         for task in VTV
     ]

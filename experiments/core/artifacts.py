@@ -6,6 +6,7 @@ bit on a disk raises no error of its own.  Files without this key, such as those
 
 import dataclasses
 import enum
+import io
 import json
 import math
 import os
@@ -82,6 +83,13 @@ def write_bytes(path: Path, content: bytes) -> None:
 def write_text(path: Path, text: str) -> None:
     """Publish a UTF-8 text atomically."""
     write_bytes(path, text.encode())
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = False) -> None:
+    """Publish arrays as one NumPy file, atomically."""
+    buffer = io.BytesIO()
+    (np.savez_compressed if compressed else np.savez)(buffer, **arrays)
+    write_bytes(path, buffer.getvalue())
 
 
 def write_json(path: Path, value: Any) -> None:

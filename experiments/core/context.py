@@ -9,10 +9,11 @@ import json
 import os
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 from rich.console import Console
 
 from experiments.core.artifacts import (
@@ -20,11 +21,13 @@ from experiments.core.artifacts import (
     UnwrittenError,
     jsonable,
     read_json,
+    write_arrays,
     write_sealed,
     write_text,
 )
 from experiments.core.progress import Advance, Loop, ProgressCallback, TrainingSample, Watcher, show_progress
 from experiments.core.stopping import Stopping
+from sensors_io.arrays import ArraysError, load_arrays
 from sensors_io.json_files import CHECKSUM, seal, unseal
 from sensors_io.units import HERE, Launcher
 from touchr1_jax.distributed.processes import SINGLE_PROCESS, ProcessGroup, SingleDevice
@@ -265,6 +268,19 @@ class Context:
         if not self.done(stage):
             self.save_stage(stage, compute())
         return self.load_stage(stage)
+
+    def cached_arrays(
+        self, name: str, make: Callable[[], Mapping[str, Any]], *, compressed: bool = False
+    ) -> dict[str, np.ndarray]:
+        """The arrays in `name`.npz of the cache, made first where it is missing, and again where it is damaged."""
+        path = self.cache_dir / f"{name}.npz"
+        if path.exists():
+            try:
+                return load_arrays(path)
+            except ArraysError as error:
+                self.print(f"{error}: it is made again")
+        write_arrays(path, make(), compressed=compressed)
+        return load_arrays(path)
 
     @contextlib.contextmanager
     def timed(self, stage: str) -> Iterator[None]:

@@ -29,17 +29,7 @@ from experiments.core.context import Context
 from experiments.core.results import Cell, Picture, Results, Table, named_table
 from experiments.core.runner import Experiment
 from experiments.encoder.pretrain import pretrain
-from experiments.paper.label_curves import (
-    COMPARED,
-    METHODS,
-    PRETRAINED,
-    RANDOM,
-    Method,
-    compared_pairs,
-    curve_chart,
-    curve_table,
-    verdict,
-)
+from experiments.paper import label_curves as curves
 from experiments.paper.label_free import agreed_levels, measured_levels
 from experiments.study.answers import answers_path, load_answers, save_answers
 from experiments.study.dataset import Dataset
@@ -129,9 +119,9 @@ class LabelledSet(StudySeed):
     measured: np.ndarray
     name: str
 
-    def answers(self) -> dict[Method, Evaluation]:
+    def answers(self) -> dict[curves.Method, Evaluation]:
         """Answers of every method about the test contacts, kept in the run."""
-        paths = {method: self._path(method) for method in METHODS}
+        paths = {method: self._path(method) for method in curves.METHODS}
         if not all(path.exists() for path in paths.values()):
             self._train()
         return {method: load_answers(path) for method, path in paths.items()}
@@ -218,7 +208,7 @@ def run(config: FewLabelsConfig, context: Context) -> Results:
             evidence = gather_evidence(few, probed, config.probe, context)
             if not len(few.parts["grpo"]):  # everything is labelled: label-free rewards ask about the same contacts
                 few = with_parts(data, order[:count], order[: config.unlabelled])
-            for encoder, start in ((RANDOM, None), (PRETRAINED, tactile)):
+            for encoder, start in ((curves.RANDOM, None), (curves.PRETRAINED, tactile)):
                 name = f"{min(count, len(train))}-{encoder}"
                 of_set = LabelledSet(**made, data=few, evidence=evidence, tactile=start, seed=seed, name=name)
                 for method, evaluation in of_set.answers().items():
@@ -249,7 +239,7 @@ def implied_table(config: FewLabelsConfig, context: Context, counts: Sequence[in
     """Share of levels that each label-free reward pays, and of those that are right, means over seeds."""
     lines: list[dict[str, Cell]] = []
     for method in ("agreement", "physics"):
-        for name in (f"{count}-{encoder}" for encoder in (RANDOM, PRETRAINED) for count in counts):
+        for name in (f"{count}-{encoder}" for encoder in (curves.RANDOM, curves.PRETRAINED) for count in counts):
             found = [context.load_stage(f"implied/{method}-{name}/{seed}") for seed in range(config.seeds)]
             right = [x for _, x in found if x is not None]
             share = float(np.mean([x for x, _ in found]))
@@ -274,20 +264,20 @@ def report(
 ) -> Results:
     """Learning curves, their differences, and where each method pays."""
     rows = estimate_rows(scored, objects)
-    pairs = [pair for count in counts for pair in compared_pairs(count)]
-    comparisons = [c for pair in pairs for c in compare_rows(*pair, COMPARED, scored, rows, objects)]
+    pairs = [pair for count in counts for pair in curves.compared_pairs(count)]
+    comparisons = [c for pair in pairs for c in compare_rows(*pair, curves.COMPARED, scored, rows, objects)]
     return Results(
-        verdict=verdict(comparisons, counts),
+        verdict=curves.verdict(comparisons, counts),
         arms=rows,
         comparisons=tuple(comparisons),
-        tables=(curve_table(rows, comparisons, counts), implied),
+        tables=(curves.curve_table(rows, comparisons, counts), implied),
         pictures=(
             Picture(
                 name="few_labels",
                 title="Learning curves",
                 caption="Right answers about unseen objects by the number of labelled contacts, mean of hardness, "
                 "roughness and protrusion, seeds pooled; 95 % over objects.",
-                content=curve_chart(rows, counts),
+                content=curves.curve_chart(rows, counts),
             ),
         ),
         settings={**study_settings(config), "stage 1": f"{config.pretrain.objective}, {config.pretrain.steps} steps"},

@@ -12,8 +12,8 @@ from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
 from experiments.core.results import Cell, Table, named_table
 from experiments.recordings.descriptions import AuxiliaryData, DescribedVideos
-from experiments.recordings.learning import LearnConfig, answer_log_probs, learn, probe_probabilities
-from experiments.recordings.level_probes import GROUPS, READINGS, SCENES
+from experiments.recordings.learning import LearnConfig, answer_log_probs, learn
+from experiments.recordings.level_probes import GROUPS, READINGS, SCENES, ProbedVideos
 from sensors_io.touches import families
 from touchr1_jax.bench.metrics import Scores, accuracy, mean_accuracy, ordinal_mae
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
@@ -105,13 +105,14 @@ class CrossValidation:
         self, config: LearnConfig | None = None, auxiliary: AuxiliaryData | None = None, objects: int | None = None
     ) -> Float[np.ndarray, "n 27"]:
         """As `policy`, by probes alone that learn from so many of the objects of the other folds, all by default."""
-        videos, found = self.videos, np.zeros((len(self.videos.names), len(COMBINATIONS)))
+        config, auxiliary, videos = config or self.config, auxiliary or self.auxiliary, self.videos
+        found = np.zeros((len(videos.names), len(COMBINATIONS)))
         for k in self.context.each("probes", np.unique(self.fold)):
             names = np.unique(videos.objects[self.fold != k])
             kept = np.random.default_rng(0).permutation(names)[:objects]
             training, out = videos.rows(np.isin(videos.objects, kept)), self.fold == k
-            p = probe_probabilities(config or self.config, training, auxiliary or self.auxiliary, videos.rows(out))
-            found[out] = joint_log_prob(p)
+            read = ProbedVideos(training, auxiliary, videos.rows(out), config.evidence)
+            found[out] = joint_log_prob(read.evidence())
         return found
 
     def policy_variants(self) -> dict[str, np.ndarray]:
@@ -177,8 +178,8 @@ class CrossValidation:
         known = np.zeros_like(videos.label)
         for k in self.context.each("touched before", np.unique(trial)):
             out = trial == k
-            p = probe_probabilities(config, videos.rows(~out), self.auxiliary, videos.rows(out))
-            known[out] = choose(joint_log_prob(p))
+            read = ProbedVideos(videos.rows(~out), self.auxiliary, videos.rows(out), config.evidence)
+            known[out] = choose(joint_log_prob(read.evidence()))
         return {
             "probes": choose(self.probes()),
             "probes, the object was touched before": known,

@@ -2,7 +2,6 @@
 
 import dataclasses
 import hashlib
-import io
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -10,10 +9,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from experiments.core.artifacts import write_bytes
 from experiments.core.context import Context
 from experiments.study.sources import SourceConfig, prepare_records
-from sensors_io.arrays import ArraysError, load_arrays
 from sensors_io.errors import MALFORMED
 from sensors_io.importers.keep import ImportSourceError, Skip
 from sensors_io.importers.physiclear import read_labels
@@ -203,16 +200,6 @@ def describe_scenes(config: SceneConfig, context: Context) -> tuple[np.ndarray, 
 def _cached(
     context: Context, name: str, identity: Sequence[object], make: Callable[[], dict[str, np.ndarray]]
 ) -> dict[str, np.ndarray]:
-    """Arrays from a file of the cache that is named by the hash of an identity; made first if it is missing."""
+    """Arrays from a file of the cache that is named by the hash of an identity."""
     digest = hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:16]
-    path = context.cache_dir / f"{name}-{digest}.npz"
-    if path.exists():
-        try:
-            return load_arrays(path)
-        except ArraysError as error:
-            context.print(f"{error}: it is made again")
-    buffer = io.BytesIO()
-    arrays = make()
-    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
-    write_bytes(path, buffer.getvalue())
-    return arrays
+    return context.cached_arrays(f"{name}-{digest}", make, compressed=True)

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import hashlib
-import io
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +14,7 @@ import numpy as np
 from flax import traverse_util
 from jaxtyping import Float
 
-from experiments.core.artifacts import jsonable, write_bytes
+from experiments.core.artifacts import jsonable, write_arrays
 from experiments.core.context import Context
 from experiments.core.loops import stage_hooks
 from experiments.recordings.descriptions import ROWS, AuxiliaryData, DescribedVideos
@@ -135,13 +134,6 @@ def answer_log_probs(
     return jax.device_get(description_policy(config.shape).posterior(trained.params, x))[: len(rows)]
 
 
-def probe_probabilities(
-    config: LearnConfig, training: DescribedVideos, auxiliary: AuxiliaryData, videos: DescribedVideos
-) -> Float[np.ndarray, "n A K"]:
-    """Probabilities of the probes without a policy."""
-    return ProbedVideos(training, auxiliary, videos, config.evidence).evidence()
-
-
 def _lesson(config: LearnConfig, read: ProbedVideos, training: DescribedVideos, seed: int) -> Lesson:
     """Prompts about the training objects: each of its videos alone or, if prompts hold several, draws of them.
 
@@ -178,9 +170,7 @@ def save(path: Path, trained: TrainedEnsemble) -> None:
     """Publish an ensemble as one file."""
     videos = {name: getattr(trained.training, name) for name in ROWS}
     parts = {"params": trained.params, "training": videos, "auxiliary": dict(vars(trained.auxiliary))}
-    buffer = io.BytesIO()
-    np.savez(buffer, identity=identity(trained.config), **traverse_util.flatten_dict(parts, sep="/"))
-    write_bytes(path, buffer.getvalue())
+    write_arrays(path, {"identity": identity(trained.config), **traverse_util.flatten_dict(parts, sep="/")})
 
 
 def identity(config: LearnConfig) -> str:

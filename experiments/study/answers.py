@@ -1,14 +1,13 @@
 """Answers of a policy, kept as one file of a run; the levels that they conclude."""
 
 import dataclasses
-import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Int
 
-from experiments.core.artifacts import write_bytes
+from experiments.core.artifacts import write_arrays
 from experiments.core.context import Context
 from sensors_io.arrays import load_arrays
 from touchr1_jax.training.evaluation import Evaluation
@@ -37,12 +36,9 @@ def answers_path(context: Context, name: str, seed: int) -> Path:
 
 def save_answers(path: Path, evaluation: Evaluation) -> None:
     """Publish answers as one file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     flat: dict[str, Any] = {f: getattr(evaluation, f) for f in _FLAT if getattr(evaluation, f) is not None}
     flat |= {f"parsed_{f}": getattr(evaluation.parsed, f) for f in _PARSED}
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **flat)
-    write_bytes(path, buffer.getvalue())
+    write_arrays(path, flat, compressed=True)
 
 
 def load_answers(path: Path) -> Evaluation:

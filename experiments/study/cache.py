@@ -8,7 +8,6 @@ checkpoints outlive changes there.
 
 import functools
 import hashlib
-import io
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -19,7 +18,7 @@ import numpy as np
 from flax import traverse_util
 
 from experiments.core import numerics
-from experiments.core.artifacts import jsonable, write_bytes
+from experiments.core.artifacts import jsonable, write_arrays
 from experiments.core.context import Context, read_metrics
 from experiments.core.runs import ROOT, versions
 from sensors_io.arrays import load_arrays
@@ -83,7 +82,8 @@ def cached(
         except DAMAGED as error:
             context.print(f"{stage}: {path} is damaged ({error}), and is made again")
     params = train()
-    context.processes.write_once(lambda: _publish(path, params, _logged(context, stage)))
+    lines = np.frombuffer(json.dumps(_logged(context, stage)).encode(), np.uint8)
+    context.processes.write_once(lambda: write_arrays(path, {_LINES: lines, **_flat(params)}))
     return params
 
 
@@ -114,12 +114,6 @@ def source_digest(without: tuple[str, ...] = LATER, root: Path = ROOT) -> str:
 def _flat(tree: Mapping[str, Any]) -> dict[str, Any]:
     """Arrays named by their path, joined by "/"."""
     return {name: np.asarray(x) for name, x in traverse_util.flatten_dict(tree, sep="/").items()}
-
-
-def _publish(path: Path, params: Params, lines: list[dict[str, Any]]) -> None:
-    buffer = io.BytesIO()
-    np.savez(buffer, **{_LINES: np.frombuffer(json.dumps(lines).encode(), np.uint8), **_flat(params)})
-    write_bytes(path, buffer.getvalue())
 
 
 def read_policy(path: Path) -> tuple[Params, list[dict[str, Any]]]:
