@@ -76,9 +76,6 @@ def crossed(
     Args:
       read: (objects to learn from, number of the reader) → its log-probabilities for all contacts.
       objects: dealt to folds; each is read by the reader of the other folds, all others by the mean of all readers.
-
-    Raises:
-      ValueError: fewer objects than folds.
     """
     fold = group_folds(objects, PROBE)
     found = np.stack([read(objects[fold != k], k) for k in range(PROBE.folds)])

@@ -43,8 +43,7 @@ class ComparedFigure(NamedTuple):
 def compare_runs(runs: Sequence[PastRun], most: int) -> str:
     """Compare runs as text: runs, differing settings, at most `most` figures that differ, shared ones first, cost.
 
-    Raises:
-      ComparisonError: fewer than two runs, the same run twice, an unfinished run, or runs without a common figure.
+    `ComparisonError` for fewer than two runs, one named twice, an unfinished one, or runs without a common figure.
     """
     if len(runs) < 2:
         raise ComparisonError(f"{len(runs)} run is named: must be at least two; name another")

@@ -64,11 +64,7 @@ class MetricLog:
             watcher.rewound(stage, step)
 
     def append(self, stage: str, step: int, scalars: dict[str, Any]) -> None:
-        """Add one line and flush it.
-
-        Raises:
-          ValueError: a scalar is not finite, or takes the name of a field.
-        """
+        """Add one line and flush it; `ValueError` for a scalar that is not finite or takes the name of a field."""
         taken = {"stage", "step", CHECKSUM} & set(scalars)
         if taken:
             raise ValueError(f"scalars holds {sorted(taken)}: these are fields of every line; rename them")
@@ -212,11 +208,7 @@ class Context:
             yield report
 
     def require_logged(self, stage: str, steps: int) -> None:
-        """Require that the log has every step before a checkpoint, so that no run ends with a part of its log.
-
-        Raises:
-          DamagedFileError: a line is missing.
-        """
+        """`DamagedFileError` unless the log has every step before a checkpoint: no run ends with a part of it."""
         if steps == 0 or not self.processes.writes:
             return
         seen = {row["step"] for row in read_metrics(self.directory) if row["stage"] == stage}
@@ -252,12 +244,7 @@ class Context:
         self.processes.write_once(lambda: write_sealed(self._stage_file(stage), content))
 
     def load_stage(self, stage: str) -> Any:
-        """The saved result of a finished stage, in JSON's types.
-
-        Raises:
-          FileNotFoundError: the stage is not done.
-          DamagedFileError: its result is damaged.
-        """
+        """The saved result of a finished stage, in JSON's types; `FileNotFoundError` if the stage is not done."""
         path = self._stage_file(stage)
         if not path.exists():
             raise FileNotFoundError(f"stage {stage!r} has no result at {path}: finish and save the stage first")

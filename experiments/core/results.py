@@ -160,11 +160,7 @@ class Comparison(_Ci95):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Trace:
-    """A text and its parsed pieces, in order and disjoint.
-
-    Raises:
-      ResultsError: pieces that overlap, are out of order or end past the text.
-    """
+    """A text and its parsed pieces, which must be in order, disjoint and end with the text at the latest."""
 
     text: str
     slots: tuple[Slot, ...]

@@ -136,8 +136,7 @@ def main(arguments: Sequence[str], package: str = "experiments") -> int:
 def options_of(vary: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """Option → its values, from words such as `grpo.lr_scale=50,100`; dashes and underscores are the same.
 
-    Raises:
-      SweepError: a word without an option and values, or an option named twice.
+    `SweepError` for a word without an option and values, or an option named twice.
     """
     found: dict[str, tuple[str, ...]] = {}
     for word in vary:
@@ -159,10 +158,8 @@ def plan(
     """The folder of a sweep and its units, in the order of the values, the last option fastest.
 
     Args:
-      experiment, about: what runs, and its docstring.
       vary: options and their values, as `options_of` takes them.
       rest: words of the command line for all runs.
-      runs_dir: folder of all runs.
       into: the folder; by default named after the units, so that the same sweep goes on in it.
 
     Raises:

@@ -189,9 +189,6 @@ class Events(Watcher):
 
     A continued stage gets one more file, whose first event makes TensorBoard drop the events of the last session at or
     past its step.  Events have a time, lines of `metrics.jsonl` do not.
-
-    Raises:
-      ModuleNotFoundError: tensorboardX is not installed.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -223,12 +220,6 @@ class WeightsAndBiases(Watcher):
     """Sends every number of every logged line to Weights & Biases, with a step of its own for every stage.
 
     A continued run goes on in the same place.  Its environment variables count, such as WANDB_MODE and WANDB_PROJECT.
-
-    Args:
-      directory, description: of the run.
-
-    Raises:
-      ModuleNotFoundError: wandb is not installed.
     """
 
     def __init__(self, directory: Path, description: Mapping[str, Any]) -> None:

@@ -194,12 +194,9 @@ class ComponentEffect:
 def component_effects(
     steps: Sequence[ComponentStep], rows: Mapping[str, SeedScores], objects: np.ndarray
 ) -> tuple[ComponentEffect, ...]:
-    """Every step in every metric of the ladder that both of its arms have.
+    """Every step in every metric of the ladder that both of its arms have, two seeds at least.
 
     An arm of one seed, a baseline, is compared with every seed of the other; `objects` [N] is that of each question.
-
-    Raises:
-      ValueError: two arms of different numbers of seeds, or fewer than two seeds.
     """
     found = [
         _effect(step, metric, *_paired(step, metric.metric, rows), objects)

@@ -37,10 +37,7 @@ def deal_folds(objects: np.ndarray, label: Int[np.ndarray, "n A"], count: int, s
     """Fold of each video, all of an object in one, objects of one combination of levels spread over the folds.
 
     Objects are dealt in turn, combination by combination, in the order of a hash, so that neither the order of the
-    videos nor the random generator's version matters.
-
-    Raises:
-      ConfigurationError: fewer objects than folds.
+    videos nor the random generator's version matters; they must be as many as folds.
     """
     names, first = np.unique(objects, return_index=True)
     if len(names) < count:

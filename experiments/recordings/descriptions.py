@@ -74,9 +74,7 @@ def describe_source(source: Path, frames: int, context: Context, objects: int | 
     """Describe so many frames in contact of the videos of a folder that holds labels.json and videos/.
 
     `objects` takes so many labelled ones, the first of the table; `None` takes all, unlabelled ones too.
-
-    Raises:
-      ImportSourceError: as `read_labels`, a ratings.json that is not as described, or not one readable video.
+    `ImportSourceError` as of `read_labels` and `read_ratings`, or without one readable video.
     """
     entries = read_labels(source / "labels.json")
     if objects is not None:
@@ -93,11 +91,7 @@ def describe_source(source: Path, frames: int, context: Context, objects: int | 
 
 
 def read_ratings(path: Path) -> dict[str, Float[np.ndarray, "A"]]:
-    """Ratings of objects by people, 0 to 10, NaN for an attribute that was not rated; none where there is no file.
-
-    Raises:
-      ImportSourceError: a file that is not {"objects": {name: {attribute: number}}}.
-    """
+    """Ratings of objects by people, 0 to 10, NaN for an attribute that was not rated; none where there is no file."""
     if not path.is_file():
         return {}
     try:
@@ -108,11 +102,7 @@ def read_ratings(path: Path) -> dict[str, Float[np.ndarray, "A"]]:
 
 
 def videos_of(places: Sequence[Path]) -> list[Path]:
-    """The videos that are named, a folder standing for those in it.
-
-    Raises:
-      ImportSourceError: no such video or folder, or a folder without a video.
-    """
+    """The videos that are named, a folder standing for those in it; `ImportSourceError` where there is none."""
     files = []
     for place in places:
         inside = sorted(p for p in place.iterdir() if p.suffix.lower() in SUFFIXES) if place.is_dir() else [place]

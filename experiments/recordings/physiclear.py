@@ -97,11 +97,7 @@ class PhysiclearStudy:
 
 
 def run(config: PhysiclearStudy, context: Context) -> Results:
-    """Validate and train, or predict.
-
-    Raises:
-      ConfigurationError: data_dir is missing, or one of predict and out.
-    """
+    """Validate and train, or predict; `ConfigurationError` without data_dir, or with one of predict and out alone."""
     if bool(config.predict) != (config.out is not None):
         raise ConfigurationError(f"predict is {config.predict}, out {config.out}: give both to predict, or neither")
     if config.out is not None:

@@ -68,11 +68,7 @@ def find_policy(name: str, runs_dir: Path, weights: Path | None = None) -> Askab
     """A policy by the folder of a run, RUN, RUN/ARM or RUN/ARM/SEED, or by what `load_policy` takes.
 
     Of a run the policy of SFT and the first seed is taken, since every study has it.  A policy may lie at a URL.
-    `weights` as in `load_policy`.
-
-    Raises:
-      PolicyError: there is none, or it cannot be read.
-      StoreError: the URL cannot be read.
+    `weights` as in `load_policy`; `PolicyError` or `StoreError` if there is none that can be read.
     """
     if at_url(name):
         with tempfile.TemporaryDirectory() as copied:
@@ -146,11 +142,7 @@ def run_policy(name: str, runs_dir: Path) -> Path | None:
 
 
 def clip_of(saved: SavedPolicy) -> ClipConfig:
-    """The clips that a policy reads.
-
-    Raises:
-      PolicyError: it leaves out frames by a flag that this version does not know.
-    """
+    """The clips that a policy reads; `PolicyError` if it leaves out frames by a flag that is unknown here."""
     unknown = sorted({*saved.reads.rejected} - {*Flag.__members__})
     if unknown:
         raise PolicyError(f"policy leaves out frames with the flags {', '.join(unknown)}: unknown; update touchr1-jax")

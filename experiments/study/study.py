@@ -69,9 +69,7 @@ def train_parts(
 ) -> None:
     """Have workers train the policies of a study that are not in the cache yet; they depend on `values` alone.
 
-    Raises:
-      DataError: the study takes no policies from the cache.
-      LauncherError, UnitsError: as `units.finish`.
+    `DataError` if the study takes none from the cache; `LauncherError` and `UnitsError` as of `units.finish`.
     """
     if not share:
         raise DataError("share is False: workers hand policies over by the cache; leave --launcher out, or set --share")
@@ -234,9 +232,7 @@ def check_arms(
 ) -> None:
     """Try every weighted reward of every arm, so that a misfit is reported before anything is made.
 
-    Raises:
-      RewardError: as `check_rewards`; it names the arm.
-      ValueError: a variant of a policy that is not there, or with the name of one.
+    `RewardError` names the arm; `ValueError` for a variant of a policy that is not there, or with the name of one.
     """
     known = rewards or make_rewards(uniform_prior([len(a.levels) for a in TOUCH_LANGUAGE.attributes]))
     for arm, weights in arms.items():
