@@ -178,24 +178,25 @@ def run_experiment(experiment: Experiment[Any], arguments: Sequence[str], about:
     except (ValueError, LauncherError) as error:  # a configuration refuses its own values, or one is not finite
         print_error(f"{type(error).__name__}: {error}")
         return 2
-    if at_url(command.runs_dir):
-        print_error(
-            f"runs-dir is {command.runs_dir}: must be a folder, for a run locks, appends to and replaces its files, "
-            "which no store can; name one, and afterwards `export` a policy to the URL"
-        )
-        return 2
-    for flag in watchers.PACKAGES:
-        if getattr(command, flag) and (hint := watchers.missing(flag)):
-            print_error(hint)
-            return 2
-    if not experiment.spreads and (command.launch != Launch() or command.launcher != HERE):
-        print_error(f"{experiment.name} runs in one process on one device; leave --distributed, --mesh, --launcher out")
-        return 2
-    if command.launch.distributed and command.launcher != HERE:
-        print_error("--distributed and --launcher both spread the run: leave one out")
+    if why := _refusal(experiment, command):
+        print_error(why)
         return 2
     with compiled_quickly() if command.scale in experiment.quick else contextlib.nullcontext():
         return _execute(experiment, command, about, shlex.join([*PROG.split(), experiment.name, *arguments]))
+
+
+def _refusal(experiment: Experiment[Any], command: Any) -> str:
+    """The reason why a command cannot run, and the fix; empty if it can."""
+    if at_url(command.runs_dir):
+        return (
+            f"runs-dir is {command.runs_dir}: must be a folder, for a run locks, appends to and replaces its files, "
+            "which no store can; name one, and afterwards `export` a policy to the URL"
+        )
+    if not experiment.spreads and (command.launch != Launch() or command.launcher != HERE):
+        return f"{experiment.name} runs in one process on one device; leave --distributed, --mesh, --launcher out"
+    if command.launch.distributed and command.launcher != HERE:
+        return "--distributed and --launcher both spread the run: leave one out"
+    return next(filter(None, (watchers.missing(flag) for flag in watchers.PACKAGES if getattr(command, flag))), "")
 
 
 def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> Any:

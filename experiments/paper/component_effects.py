@@ -13,9 +13,8 @@ from experiments.core.results import Estimate, Picture, Results, Table, named_ta
 from experiments.core.text import bounds, interval, number
 from experiments.study.ablation import Ablation, run_ablation
 from experiments.study.alarm_log import ALARM
-from experiments.study.baselines import baselines
 from experiments.study.estimates import RESAMPLES, SeedScores, estimate
-from experiments.study.scores import Scored, score
+from experiments.study.scores import Scored, baselines, score
 from experiments.study.study import Study, StudyConfig
 from touchr1_jax.bench.metrics import Scores, mean_accuracy
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap, crossed_test, holm, student_interval

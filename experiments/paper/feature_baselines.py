@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from experiments.core.errors import DataError
-from experiments.study.baselines import level_answers
+from experiments.study.scores import level_answers
 from experiments.study.seed import TrainedPolicy
 from experiments.study.stages import encode_rows
 from sensors_io.records import RecordStore

@@ -19,17 +19,18 @@ import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
 
 from experiments.core.artifacts import write_bytes
+from experiments.core.charts import Panel, draw, estimates
 from experiments.core.context import Context
-from experiments.core.results import Cell, Picture, Results, Table, named_table
+from experiments.core.results import Cell, Comparison, Estimate, Picture, Results, Table, named_table
 from experiments.core.runner import Experiment
+from experiments.core.text import bounds, interval
 from experiments.encoder.pretrain import pretrain
-from experiments.paper import label_curves as curves
 from experiments.paper.label_free import agreed_levels, measured_levels
 from experiments.study.answers import answers_path, load_answers, save_answers
 from experiments.study.dataset import Dataset
@@ -65,6 +66,13 @@ from touchr1_jax.types import Params
 from touchr1_jax.validation import at_least
 
 REWARDS: Weights = {"exact": 0.9, "format": 0.1}
+
+Method = Literal["sft", "two_phases", "grpo", "agreement", "physics"]
+METHODS: tuple[Method, ...] = ("sft", "two_phases", "grpo", "agreement", "physics")
+
+RANDOM, PRETRAINED = "random", "pretrained"  # encoders that SFT starts from
+
+COMPARED = ("acc", "omae", "mat_acc")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -119,9 +127,9 @@ class LabelledSet(StudySeed):
     measured: np.ndarray
     name: str
 
-    def answers(self) -> dict[curves.Method, Evaluation]:
+    def answers(self) -> dict[Method, Evaluation]:
         """Answers of every method about the test contacts, kept in the run."""
-        paths = {method: self._path(method) for method in curves.METHODS}
+        paths = {method: self._path(method) for method in METHODS}
         if not all(path.exists() for path in paths.values()):
             self._train()
         return {method: load_answers(path) for method, path in paths.items()}
@@ -208,7 +216,7 @@ def run(config: FewLabelsConfig, context: Context) -> Results:
             evidence = gather_evidence(few, probed, config.probe, context)
             if not len(few.parts["grpo"]):  # everything is labelled: label-free rewards ask about the same contacts
                 few = with_parts(data, order[:count], order[: config.unlabelled])
-            for encoder, start in ((curves.RANDOM, None), (curves.PRETRAINED, tactile)):
+            for encoder, start in ((RANDOM, None), (PRETRAINED, tactile)):
                 name = f"{min(count, len(train))}-{encoder}"
                 of_set = LabelledSet(**made, data=few, evidence=evidence, tactile=start, seed=seed, name=name)
                 for method, evaluation in of_set.answers().items():
@@ -239,7 +247,7 @@ def implied_table(config: FewLabelsConfig, context: Context, counts: Sequence[in
     """Share of levels that each label-free reward pays, and of those that are right, means over seeds."""
     lines: list[dict[str, Cell]] = []
     for method in ("agreement", "physics"):
-        for name in (f"{count}-{encoder}" for encoder in (curves.RANDOM, curves.PRETRAINED) for count in counts):
+        for name in (f"{count}-{encoder}" for encoder in (RANDOM, PRETRAINED) for count in counts):
             found = [context.load_stage(f"implied/{method}-{name}/{seed}") for seed in range(config.seeds)]
             right = [x for _, x in found if x is not None]
             share = float(np.mean([x for x, _ in found]))
@@ -264,25 +272,104 @@ def report(
 ) -> Results:
     """Learning curves, their differences, and where each method pays."""
     rows = estimate_rows(scored, objects)
-    pairs = [pair for count in counts for pair in curves.compared_pairs(count)]
-    comparisons = [c for pair in pairs for c in compare_rows(*pair, curves.COMPARED, scored, rows, objects)]
+    pairs = [pair for count in counts for pair in compared_pairs(count)]
+    comparisons = [c for pair in pairs for c in compare_rows(*pair, COMPARED, scored, rows, objects)]
     return Results(
-        verdict=curves.verdict(comparisons, counts),
+        verdict=verdict(comparisons, counts),
         arms=rows,
         comparisons=tuple(comparisons),
-        tables=(curves.curve_table(rows, comparisons, counts), implied),
+        tables=(curve_table(rows, comparisons, counts), implied),
         pictures=(
             Picture(
                 name="few_labels",
                 title="Learning curves",
                 caption="Right answers about unseen objects by the number of labelled contacts, mean of hardness, "
                 "roughness and protrusion, seeds pooled; 95 % over objects.",
-                content=curves.curve_chart(rows, counts),
+                content=curve_chart(rows, counts),
             ),
         ),
         settings={**study_settings(config), "stage 1": f"{config.pretrain.objective}, {config.pretrain.steps} steps"},
         data=data.summary(),
     )
+
+
+def compared_pairs(count: int) -> list[tuple[str, str]]:
+    """Policies that are compared: each method with the one that it starts from, and pretrained with random encoders."""
+    before: Mapping[Method, Method] = {"two_phases": "sft", "grpo": "two_phases"}
+    before = {**before, "agreement": "two_phases", "physics": "two_phases"}
+    of_methods = [(f"{a}-{count}-{e}", f"{b}-{count}-{e}") for e in (RANDOM, PRETRAINED) for a, b in before.items()]
+    of_encoders = [(f"{m}-{count}-{PRETRAINED}", f"{m}-{count}-{RANDOM}") for m in ("sft", "two_phases")]
+    return of_methods + of_encoders
+
+
+def verdict(comparisons: Sequence[Comparison], counts: Sequence[int]) -> tuple[str, ...]:
+    """For each step of training, numbers of labels at which it pays, and at which it costs, beyond both intervals."""
+    steps = {
+        "SFT in two phases": ("two_phases", "sft", None),
+        "GRPO on labelled contacts": ("grpo", "two_phases", None),
+        "agreement of sensors without labels": ("agreement", "two_phases", None),
+        "measured physics without labels": ("physics", "two_phases", None),
+        "stage 1": ("two_phases", "two_phases", PRETRAINED),
+    }
+    sentences = []
+    for title, (a, b, encoder) in steps.items():
+        pays, costs = [], []
+        for count in counts:
+            for start in (RANDOM, PRETRAINED) if encoder is None else (encoder,):
+                of = f"{a}-{count}-{start}", f"{b}-{count}-{start if encoder is None else RANDOM}"
+                found = [c for c in comparisons if (c.arm, c.against) == of and c.metric == "acc"]
+                label = f"{count} labels" + (f" ({start} encoder)" if encoder is None else "")
+                if found and all(c.low > 0 for c in found):
+                    pays.append(f"{label} {found[0].difference:+.1f}")
+                if found and all(c.high < 0 for c in found):
+                    costs.append(f"{label} {found[0].difference:+.1f}")
+        sentences.append(
+            f"{title[0].upper()}{title[1:]} raises accuracy beyond chance at {', '.join(pays) or 'no number of labels'}"
+            f" and lowers it at {', '.join(costs) or 'none'}."
+        )
+    return tuple(sentences)
+
+
+def curve_table(
+    rows: Mapping[str, Mapping[str, Estimate]], comparisons: Sequence[Comparison], counts: Sequence[int]
+) -> Table:
+    """Every policy with its difference from the one that it starts from."""
+    lines: list[dict[str, Cell]] = []
+    for encoder in (RANDOM, PRETRAINED):
+        for count in counts:
+            for method in METHODS:
+                name = f"{method}-{count}-{encoder}"
+                row = rows[name]
+                line: dict[str, Cell] = {"policy": name, "accuracy": interval(row["acc"], ".1f")}
+                line |= {"OMAE": row["omae"].mean, "material": row["mat_acc"].mean if "mat_acc" in row else None}
+                for c in comparisons:
+                    same = c.arm == name and c.metric == "acc" and c.against.endswith(f"-{encoder}")
+                    if same and c.over == "objects":
+                        line["gain"] = f"{c.difference:+.1f} {bounds(c.low, c.high, '.1f')}"
+                lines.append(line)
+    return named_table(
+        "Policies by method, labelled contacts and encoder",
+        lines,
+        formats={"OMAE": ".3f", "material": ".1f"},
+        units={"accuracy": "%", "OMAE": "levels", "material": "%", "gain": "points"},
+        meanings={"gain": "accuracy minus that of the policy that training starts from, 95 % over objects"},
+        note="sft is end to end; GRPO, agreement and physics start from two_phases.",
+    )
+
+
+def curve_chart(rows: Mapping[str, Mapping[str, Estimate]], counts: Sequence[int]) -> bytes:
+    """Draw accuracy over the number of labels, a panel for each encoder."""
+    panels = []
+    for encoder in (RANDOM, PRETRAINED):
+        series = []
+        for i, method in enumerate(METHODS):
+            found = [rows[f"{method}-{count}-{encoder}"]["acc"] for count in counts]
+            series.append(estimates(method, found, at=np.arange(len(counts)), shift=0.06 * (i - 2)))
+        ticks = {float(i): str(count) for i, count in enumerate(counts)}
+        panels.append(
+            Panel(series, title=f"{encoder} encoder", x_label="labelled contacts", y_label="right (%)", x_ticks=ticks)
+        )
+    return draw(panels, size=(10.0, 4.0))
 
 
 SMOKE = FewLabelsConfig(

@@ -32,12 +32,11 @@ from experiments.paper import feature_baselines as features
 from experiments.paper import presets
 from experiments.paper.components import FULL, run_full_model
 from experiments.study import paper_numbers as paper
-from experiments.study.baselines import baselines, level_answers
 from experiments.study.controls import against_control, control_sentences, decision_table, seconds_table
 from experiments.study.estimates import compare_over_seeds
 from experiments.study.examples import rollout_examples
 from experiments.study.levels import level_report
-from experiments.study.scores import PUBLISHED, study_settings
+from experiments.study.scores import PUBLISHED, baselines, level_answers, study_settings
 from experiments.study.study import BLIND, CONTINUED, SFT, SMOKE, EvalVariant, Study, StudyConfig
 from touchr1_jax.bench.averages import AVERAGED
 from touchr1_jax.bench.questions.draw import Quota

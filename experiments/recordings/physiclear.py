@@ -30,13 +30,15 @@ from experiments.core.results import Requirement, Results, at_least, at_most, na
 from experiments.core.runner import Experiment
 from experiments.core.text import interval
 from experiments.recordings import findings
-from experiments.recordings.baselines import constants, logistic, people
 from experiments.recordings.cross_validation import (
     CrossValidation,
     agreement,
+    constants,
     deal_folds,
     intervals,
+    logistic,
     marginals,
+    people,
     pool,
     score_table,
 )
