@@ -38,6 +38,10 @@ from touchr1_jax.types import Params
 EVERY_TOUCH = "every_touch"  # the control that makes every contact; of the first seed alone
 
 
+TOUCHES = Paper(beta=0.02, kl="exact", gamma=0.0, constrained=True, enumerated=Norm.STD, learn_conclusion=False)
+"""Learns touches alone, from the probability of the right answer."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Arm:
     """A reinforced policy: most contacts, price of a second and of harm in units of a right answer."""
@@ -80,9 +84,7 @@ class LearnerConfig:
         group=16,
         micro_prompts=40,
         lr_scale=1000.0,
-        algorithm=Paper(
-            beta=0.02, kl="exact", gamma=0.0, constrained=True, enumerated=Norm.STD, learn_conclusion=False
-        ),
+        algorithm=TOUCHES,
     )
     steps: int = 200
     dropout: float = 0.1

@@ -127,10 +127,7 @@ def requirements(
     seconds = np.mean([f[several].seconds.mean() for f in seeds])
     note = f"95 % interval over objects {bounds(fixed.low, fixed.high)}"
     probes, setup = world.probes.of(world.parts["test"]), world.config.contacts
-    found = [
-        sum(report.found_motion(setup, f["chosen"].choices[:, a, 0], probes, a) for a in range(len(PROPERTIES)))
-        for f in seeds
-    ]
+    found = [len(report.found_questions(setup, f["chosen"], probes)) for f in seeds]
     accuracy = np.mean([f[several].right.mean() for f in seeds]) - every.right.mean()
     return (
         at_least("chosen over best fixed, one contact each", fixed.difference, 6.0, "points", note),

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from experiments.active.arms import as_json, from_json
+from experiments.active.arms import TOUCHES, as_json, from_json
 from experiments.active.encoder import belief_scale, belief_tokens
 from experiments.active.plans import NO_CHOICE, Answer, Played, play, same_for_all, until_sure
 from experiments.active.policies import answerer, explore, part_of, reinforce, warm_up
@@ -30,7 +30,7 @@ from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
 from touchr1_jax.models.active_policy import build_active_policy
 from touchr1_jax.models.description_policy import LANGUAGE, LEVELS
 from touchr1_jax.models.lm import DecoderConfig
-from touchr1_jax.rl.config import GRPOConfig, Norm, Paper
+from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.environment import TouchBank, TouchChoice
 from touchr1_jax.rl.touch_reward import Prices
 from touchr1_jax.training.kernel_probe import KernelProbeConfig, cross_probe, object_weights
@@ -86,9 +86,7 @@ class StoppingConfig:
         group=12,
         micro_prompts=24,
         lr_scale=1000.0,
-        algorithm=Paper(
-            beta=0.02, kl="exact", gamma=0.0, constrained=True, enumerated=Norm.STD, learn_conclusion=False
-        ),
+        algorithm=TOUCHES,
     )
     steps: int = 80
     seed: int = 0
