@@ -7,7 +7,8 @@ scored on others.
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -185,6 +186,6 @@ def _random(score: Beliefs, count: int) -> Float[np.ndarray, "n A"]:
     return _each(score, lambda a: np.mean([score.worth(a, choices) for choices in drawn], 0))
 
 
-def _each(score: Beliefs, right: Callable[[int], np.ndarray]) -> Float[np.ndarray, "n A"]:
-    """One column for each question."""
+def _each(score: Beliefs, right: Any) -> Float[np.ndarray, "n A"]:
+    """One column for each question, by a function of its number."""
     return np.stack([right(a) for a in score.questions], 1).astype(float)

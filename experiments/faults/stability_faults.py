@@ -18,9 +18,8 @@ Expected: no difference in any bit; no wrong end; every bad input answered with 
 """
 
 import dataclasses
-import functools
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -186,49 +185,47 @@ def flip_files(
     campaign, undisturbed = start_campaign(training, config.study, context)
     flips: list[Flip] = []
     ends: list[Damage] = []
-
-    def flip(state: str, home: Path, seed: int) -> list[Flip]:
-        if state == "unfinished":
-            campaign.run_part(state, undisturbed, UNFINISHED)
-        return list(flip_bits(home, scratch, context, config.flips // 2, seed))
-
     for seed, state in enumerate(("unfinished", "finished")):
         home = campaign.home / (UNDISTURBED if state == "finished" else state)
-        found = [Flip(**one) for one in context.once(f"flips/{state}", functools.partial(flip, state, home, seed))]
-        order = (undisturbed.digests, training, campaign.programs, scratch, context, config.resumed_flips // 2)
-        go_on = functools.partial(go_on_flipped, home, found, *order)
+        if not context.done(f"flips/{state}"):
+            if state == "unfinished":
+                campaign.run_part(state, undisturbed, UNFINISHED)
+            each = list(flip_bits(home, scratch, context, config.flips // 2, seed))
+            context.save_stage(f"flips/{state}", each)
+        found = [Flip(**one) for one in context.load_stage(f"flips/{state}")]
+        if not context.done(f"flips/{state}-ends"):
+            order = (undisturbed.digests, training, campaign.programs, scratch, context, config.resumed_flips // 2)
+            context.save_stage(f"flips/{state}-ends", list(go_on_flipped(home, found, *order)))
         flips += found
-        ends += [Damage(**one) for one in context.once(f"flips/{state}-ends", lambda go_on=go_on: list(go_on()))]
+        ends += [Damage(**one) for one in context.load_stage(f"flips/{state}-ends")]
     return flips, ends
 
 
 def damage_files(most: int | None, context: Context, scratch: Path) -> list[Damage]:
     """Every damaged file and the end of its run."""
-
-    def damage() -> list[Damage]:
+    if not context.done("damage"):
         unfinished, damaged = scratch / "unfinished", scratch / "damaged"
         unfinished.mkdir()
         damaged.mkdir()
         unfinished_run(unfinished)
-        return list(damage_each(unfinished, damaged, context, most))
-
-    return [Damage(**one) for one in context.once("damage", damage)]
+        context.save_stage("damage", list(damage_each(unfinished, damaged, context, most)))
+    return [Damage(**one) for one in context.load_stage("damage")]
 
 
 def try_inputs(most: int | None, context: Context, scratch: Path) -> list[InputRow]:
     """Every bad input and its answer."""
-
-    def provoke_all() -> Iterator[InputRow]:
+    if not context.done("inputs"):
         unfinished_run(scratch / "inputs")
+        rows = []
         tried = enumerate(cases(scratch / "inputs")[:most])
         for i, case in context.each("trying bad inputs", tried, still=True):  # the commands' output is captured
             folder = scratch / f"case-{i}"
             folder.mkdir()
             found = provoke(case, folder)
             answer = {"exit code": found.code, "answer": found.line.replace(str(folder), "…")}
-            yield {"input": case.name, "kind": case.kind, **answer, "faults": ", ".join(found.faults)}
-
-    return context.once("inputs", lambda: list(provoke_all()))
+            rows.append({"input": case.name, "kind": case.kind, **answer, "faults": ", ".join(found.faults)})
+        context.save_stage("inputs", rows)
+    return context.load_stage("inputs")
 
 
 def waits(config: WaitingConfig, context: Context) -> Waits:

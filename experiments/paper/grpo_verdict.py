@@ -98,7 +98,7 @@ class StartedSeed(StudySeed):
     config: GrpoVerdictConfig
     params: Params
     train: EncodedContacts
-    validation: Validation
+    held_out: Validation
     fresh: Features
 
 
@@ -159,7 +159,7 @@ def start_seed(of: StudySeed, fresh: Dataset, rows: np.ndarray) -> StartedSeed:
     train, validation = of.contacts(params), of.validation(params)
     params = of.run_decoder(of.config.decoder, f"decoder/{SFT}", train, validation, params)
     scored = encode_rows(of.policy, params, fresh, rows, of.context)
-    return of.extended(StartedSeed, params=params, train=train, validation=validation, fresh=scored)
+    return of.extended(StartedSeed, params=params, train=train, held_out=validation, fresh=scored)
 
 
 def chosen_rate(started: StartedSeed, name: str, by_rate: Mapping[float, GRPOArm]) -> float:
@@ -169,7 +169,7 @@ def chosen_rate(started: StartedSeed, name: str, by_rate: Mapping[float, GRPOArm
 
     def right(rate: float) -> float:
         params = reinforced(started, name, rate, by_rate[rate])
-        return share_right(evaluate_policy(started.policy, params, *started.validation, alone=False))
+        return share_right(evaluate_policy(started.policy, params, *started.held_out, alone=False))
 
     by = started.context.once(f"rates/{name}", lambda: {str(rate): right(rate) for rate in by_rate})
     return max(by_rate, key=lambda rate: by[str(rate)])
@@ -190,7 +190,7 @@ def train_policy(
         return reinforced(started, name, rates[name], arms[name][rates[name]])
     config = started.config
     longer = dataclasses.replace(config.continued, steps=config.continued_steps)
-    return started.continued(longer, started.train, started.validation, started.params)
+    return started.continued(longer, started.train, started.held_out, started.params)
 
 
 def asked(started: StartedSeed, name: str, train: Any, label: np.ndarray) -> Evaluation:

@@ -63,8 +63,8 @@ def compare_rows(
     found = []
     for metric in metrics:
         if metric in rows[a] and metric in rows[b]:
-            sides = ([scores[metric] for scores in scored[name]] for name in (a, b))
-            found.append(compare_over_objects(metric, a, b, *sides, objects))
+            ours, theirs = ([scores[metric] for scores in scored[name]] for name in (a, b))
+            found.append(compare_over_objects(metric, a, b, ours, theirs, objects))
             if len(scored[a]) > 1:
                 found.append(compare_over_seeds(metric, a, b, rows[a][metric], rows[b][metric]))
     return found
