@@ -1,4 +1,4 @@
-"""What the stages of a study are made of: probes, feeds, encoded contacts, arms, untrained policies."""
+"""Parts of the stages of a study: probes, feeds, encoded contacts, arms, untrained policies."""
 
 import dataclasses
 import functools
