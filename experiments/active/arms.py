@@ -31,13 +31,15 @@ from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.rl.config import GRPOConfig, Norm, Paper
 from touchr1_jax.rl.touch_reward import Prices
 from touchr1_jax.training.exploration import check_exploration, touch_batch_of
-from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import OptimizerConfig
 from touchr1_jax.training.train_sft import SFTConfig
 from touchr1_jax.types import Params
 
-EVERY_TOUCH = "every_touch"
-"""The control that makes every contact; of the first seed alone."""
+EVERY_TOUCH = "every_touch"  # the control that makes every contact; of the first seed alone
+
+
+TOUCHES = Paper(beta=0.02, kl="exact", gamma=0.0, constrained=True, enumerated=Norm.STD, learn_conclusion=False)
+"""Learns touches alone, from the probability of the right answer."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -82,9 +84,7 @@ class LearnerConfig:
         group=16,
         micro_prompts=40,
         lr_scale=1000.0,
-        algorithm=Paper(
-            beta=0.02, kl="exact", gamma=0.0, constrained=True, enumerated=Norm.STD, learn_conclusion=False
-        ),
+        algorithm=TOUCHES,
     )
     steps: int = 200
     dropout: float = 0.1
@@ -113,11 +113,7 @@ def make_policy(world: TouchWorld, config: LearnerConfig) -> ActivePolicy:
 
 
 def check_arms(world: TouchWorld, policy: ActivePolicy, arms: Mapping[str, Arm]) -> None:
-    """Try every arm's budget and prices on the objects of reinforcement before anything is trained.
-
-    Raises:
-      EnvironmentCheckError, RewardError: as `train_active`.
-    """
+    """Try every arm's budget and prices on the objects of reinforcement before anything is trained."""
     bank = part_of(world.bank, world.parts["reinforced"])
     nothing = np.zeros(0, int)
     for arm in arms.values():
@@ -217,7 +213,7 @@ def reinforced_params(
         arm.budget,
         arm.prices,
         config.dropout,
-        LoopConfig(steps=config.steps, save_every=max(1, config.steps)),
+        config.steps,
         context,
         f"grpo/{name}/{seed}",
         seed,

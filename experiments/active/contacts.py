@@ -5,8 +5,8 @@ past the limit of small strains.  The generator knows the level of all five prop
 """
 
 import dataclasses
+import functools
 import hashlib
-import io
 import itertools
 import json
 
@@ -14,12 +14,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from experiments.core.artifacts import jsonable, write_bytes
+from experiments.core.artifacts import jsonable
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
 from experiments.mechanics.identify_features import in_threads
 from experiments.mechanics.identify_motions import choose_frames
-from sensors_io.arrays import load_arrays
 from sensors_io.scenes import motions
 from sensors_io.scenes.cards import solid_of
 from sensors_io.scenes.config import PROTOCOL_FRAMES, SceneConfig, config_hash
@@ -34,8 +33,7 @@ PROPERTIES = ("hardness", "roughness", "protrusion", "elasticity", "friction")
 
 LEVELS = 3
 
-VERSION = 1
-"""Raised whenever the same configuration would give other contacts."""
+VERSION = 1  # raised whenever the same configuration would give other contacts
 
 _OBJECTS_A_FILE = 20
 
@@ -124,20 +122,17 @@ class ContactBank:
 
 def generate(config: ContactsConfig, context: Context) -> ContactBank:
     """The bank of a configuration, generated or read from the cache; a stopped run resumes."""
-    folder = context.cache_dir / "touch_bank" / contacts_hash(config)
-    starts = range(0, config.objects, _OBJECTS_A_FILE)
+    folder, read = f"touch_bank/{contacts_hash(config)}", []
+
+    def make(rows: range) -> dict[str, np.ndarray]:
+        made = in_threads(lambda i: object_contacts(config, i), rows, lambda: None)
+        return {"frames": np.stack([x for x, _ in made]), "harm": np.stack([x for _, x in made])}
+
     with context.progress("contacts", config.objects) as advance:
-        for start in starts:
-            path = folder / f"{start:06d}.npz"
+        for start in range(0, config.objects, _OBJECTS_A_FILE):
             rows = range(start, min(start + _OBJECTS_A_FILE, config.objects))
-            if not path.exists():
-                made = in_threads(lambda i: object_contacts(config, i), rows, lambda: None)
-                buffer = io.BytesIO()
-                np.savez(buffer, frames=np.stack([x for x, _ in made]), harm=np.stack([x for _, x in made]))
-                write_bytes(path, buffer.getvalue())
-            for _ in rows:
-                advance()
-    read = [load_arrays(folder / f"{start:06d}.npz") for start in starts]
+            read.append(context.cached_arrays(f"{folder}/{start:06d}", functools.partial(make, rows)))
+            advance(len(rows))
     return ContactBank(
         frames=np.concatenate([x.pop("frames") for x in read]),
         harm=np.concatenate([x["harm"] for x in read]),
@@ -155,14 +150,9 @@ def contacts_hash(config: ContactsConfig) -> str:
 
 def object_contacts(config: ContactsConfig, index: int) -> tuple[UInt8[np.ndarray, "C F H W 3"], Bool[np.ndarray, "C"]]:
     """Frames and harm of all choices of object number `index`; each motion and force touches a place of its own."""
-    frames, harm = {}, {}
-    tasks = list(itertools.product(config.motions, config.forces_n))
-    for motion, force in tasks:
-        for sensor in config.sensors:
-            made = one_contact(config, index, (sensor, motion, force))
-            frames[sensor, motion, force] = kept_frames(made, config)
-            harm[sensor, motion, force] = bool(np.any(made.flags & np.uint32(Flag.STRAIN_LIMIT)))
-    return np.stack([frames[c] for c in config.choices]), np.array([harm[c] for c in config.choices])
+    made = [one_contact(config, index, choice) for choice in config.choices]
+    harm = [bool(np.any(contact.flags & np.uint32(Flag.STRAIN_LIMIT))) for contact in made]
+    return np.stack([kept_frames(contact, config) for contact in made]), np.array(harm)
 
 
 def one_contact(config: ContactsConfig, index: int, choice: tuple[str, str, float]) -> Sequence:
@@ -180,11 +170,7 @@ def kept_frames(sequence: Sequence, config: ContactsConfig) -> UInt8[np.ndarray,
 
 
 def recorded_frames(sequence: Sequence, config: ContactsConfig) -> UInt8[np.ndarray, "F H W 3"]:
-    """The frames that are kept of a recording, whose phases nothing tells: those that stand for it.
-
-    Raises:
-      SchemaError: fewer frames than are kept.
-    """
+    """The frames that are kept of a recording, whose phases nothing tells: those that stand for it."""
     chosen = salient_frames(sequence, config.moments, ())
     if len(chosen) < config.moments:
         raise SchemaError(f"{sequence.name} has {len(chosen)} frames: must have {config.moments}; record longer")

@@ -6,6 +6,7 @@ could simply be read.
 
 import dataclasses
 import functools
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import flax.linen as nn
@@ -17,7 +18,6 @@ from flax import struct
 from jaxtyping import Array, Float, Int, UInt8
 
 from experiments.active.contacts import LEVELS, PROPERTIES, ContactBank
-from experiments.active.feed import DrawnFeed
 from experiments.core.context import Context
 from experiments.core.loops import run_loop
 from touchr1_jax.models.frame_statistics import scaled_statistics
@@ -25,8 +25,31 @@ from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
 from touchr1_jax.types import Params
 
-FAR = 5.0
-"""Standard deviations beyond which statistics are cut off."""
+
+class DrawnFeed:
+    """Batches made by a function of a generator of random numbers; batch t depends on the seed and t alone."""
+
+    def __init__(self, make: Callable[[np.random.Generator], Any], seed: int) -> None:
+        self._make, self._seed, self._step = make, seed, 0
+
+    def __iter__(self) -> Iterator[Any]:
+        return self
+
+    def __next__(self) -> Any:
+        rng = np.random.default_rng([self._seed, self._step])
+        self._step += 1
+        return self._make(rng)
+
+    def get_state(self) -> int:
+        """Number of the next batch."""
+        return self._step
+
+    def set_state(self, state: int) -> None:
+        """Go to a batch."""
+        self._step = state
+
+
+FAR = 5.0  # standard deviations beyond which statistics are cut off
 
 _CONSTANT = 1e-4  # spread below which a statistic of a choice says nothing
 
@@ -162,16 +185,7 @@ def train_reader(
     context: Context,
     seed: int,
 ) -> ContactReader:
-    """A network that learned from the contacts of some objects.
-
-    Args:
-      config: of the network.
-      statistics: of all contacts.
-      label: level of each property.
-      objects: those that it learns from.
-      context: of the run.
-      seed: of parameters and draws, and the number of its stage.
-    """
+    """A network that learned from the contacts of some objects; `seed` is that of parameters and draws."""
     choice = np.arange(statistics.shape[1], dtype=np.int32)
     fresh = ContactReader(params={}, centre=statistics[objects].mean(0), spread=statistics[objects].std(0))
     scaled = fresh.scaled(statistics, np.broadcast_to(choice, statistics.shape[:2]))

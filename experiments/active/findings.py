@@ -27,8 +27,7 @@ from experiments.study.estimates import compare_over_objects, compare_over_seeds
 from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.bench.statistics import Interval
 
-METRIC = "acc"
-"""Mean of the accuracy over the five properties."""
+METRIC = "acc"  # mean of the accuracy over the five properties
 
 RULES = ("random", "best_press", "best_fixed", "by_question")
 EQUAL = "at_equal_seconds"
@@ -128,10 +127,7 @@ def requirements(
     seconds = np.mean([f[several].seconds.mean() for f in seeds])
     note = f"95 % interval over objects {bounds(fixed.low, fixed.high)}"
     probes, setup = world.probes.of(world.parts["test"]), world.config.contacts
-    found = [
-        sum(report.found_motion(setup, f["chosen"].choices[:, a, 0], probes, a) for a in range(len(PROPERTIES)))
-        for f in seeds
-    ]
+    found = [len(report.found_questions(setup, f["chosen"], probes)) for f in seeds]
     accuracy = np.mean([f[several].right.mean() for f in seeds]) - every.right.mean()
     return (
         at_least("chosen over best fixed, one contact each", fixed.difference, 6.0, "points", note),

@@ -8,6 +8,7 @@ scored on others.
 import dataclasses
 import itertools
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -24,8 +25,7 @@ PLANS = (RANDOM, FIXED, BY_QUESTION, BY_BELIEF)
 BELIEFS = 6
 """Classes of beliefs that a tree distinguishes: the likeliest of three levels, held with more or less than `SURE`."""
 
-SURE = 0.6
-"""Probability of the likeliest level from which a belief counts as sure."""
+SURE = 0.6  # probability of the likeliest level from which a belief counts as sure
 
 _DRAWS = 400  # random sequences that stand for all
 
@@ -65,11 +65,7 @@ def headroom(
 ) -> dict[tuple[str, int], Float[np.ndarray, "n A"]]:
     """Worth of every plan for every object that is scored, by plan and greatest number of contacts.
 
-    Args:
-      find: beliefs about the objects on which plans are looked up.
-      score: beliefs about the objects that are scored.
-      contacts: greatest number of contacts.
-      kept: plans of several contacts consist of the choices that are best alone, so many for each question.
+    Plans are looked up in `find`; those of several contacts consist of the `kept` choices that are best alone.
     """
     found = {(EVERY, 0): _each(score, lambda a: score.worth(a, tuple(range(score.log_probs.shape[1]))))}
     for count in range(1, contacts + 1):
@@ -190,7 +186,6 @@ def _random(score: Beliefs, count: int) -> Float[np.ndarray, "n A"]:
     return _each(score, lambda a: np.mean([score.worth(a, choices) for choices in drawn], 0))
 
 
-def _each(score: Beliefs, right: object) -> Float[np.ndarray, "n A"]:
-    """One column for each question."""
-    assert callable(right)
+def _each(score: Beliefs, right: Any) -> Float[np.ndarray, "n A"]:
+    """One column for each question, by a function of its number."""
     return np.stack([right(a) for a in score.questions], 1).astype(float)

@@ -31,14 +31,7 @@ class Played:
 
 
 def play(bank: TouchBank, objects: Int[np.ndarray, "n"], choices: Int[np.ndarray, "n A k"], answer: Answer) -> Played:
-    """Make the chosen contacts and answer; the same for every plan.
-
-    Args:
-      bank: all contacts.
-      objects: rows of the bank.
-      choices: for every object and question.
-      answer: the policy's beliefs.
-    """
+    """Make the chosen contacts with objects of a bank and answer; the same for every plan."""
     n, questions, count = choices.shape
     flat = choices.reshape(n * questions, count)
     rows, asked = np.repeat(objects, questions), np.tile(np.arange(questions), n)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from experiments.active.feed import DrawnFeed
+from experiments.active.encoder import DrawnFeed
 from experiments.active.plans import NO_CHOICE, Answer, Played
 from experiments.core.context import Context
 from experiments.core.loops import stage_hooks
@@ -26,8 +26,7 @@ from touchr1_jax.training.sft import SFTBatch
 from touchr1_jax.training.train_sft import SFTConfig, train_sft
 from touchr1_jax.types import Params
 
-ROWS = 256
-"""Trajectories that are scored at once."""
+ROWS = 256  # trajectories that are scored at once
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,16 +85,7 @@ def warm_up(
     stage: str,
     seed: int,
 ) -> Params:
-    """SFT of a fresh policy on touches drawn at random, which ends in the right answer.
-
-    Args:
-      policy: to train.
-      bank: contacts of the objects to learn from.
-      contacts: most touches of a trajectory.
-      config: of SFT.
-      context, stage: of the run.
-      seed: of parameters and draws.
-    """
+    """SFT of a fresh policy on up to so many touches drawn at random, which ends in the right answer."""
     feed = RandomTouchFeed(policy, bank, budget=contacts, batch_size=config.batch_size, seed=seed)
     with stage_hooks(context, stage, config.steps) as hooks:
         return train_sft(policy, policy.init(seed, bank.tokens.shape[-1]), feed, config, hooks, seed=seed)
@@ -142,25 +132,17 @@ def reinforce(
     budget: int,
     prices: Prices,
     dropout: float,
-    loop: LoopConfig,
+    steps: int,
     context: Context,
     stage: str,
     seed: int,
 ) -> Params:
     """GRPO on trajectories about the objects of a bank; alarms are logged and printed once each.
 
-    Args:
-      policy, params: where it starts.
-      bank: contacts of the objects to learn from.
-      config: of a step; the length follows from the budget.
-      budget: most contacts.
-      prices: of a second and of harm.
-      dropout: probability that a sensor or a motion drops out of a prompt.
-      loop: number of steps.
-      context, stage: of the run.
-      seed: of draws.
+    The length of a step follows from the budget; a sensor or a motion drops out of a prompt with probability `dropout`.
     """
     config = dataclasses.replace(config, length=policy.tokens(budget))
+    loop = LoopConfig(steps=steps, save_every=max(1, steps))
     feed = ActiveFeed(policy, bank, batch_size=config.drawn, seed=seed, dropout=dropout)
     make_log = functools.partial(alarm_log, rules=ACTIVE_RULES)
     with stage_hooks(context, stage, loop.steps, make_log=make_log) as hooks:

@@ -157,6 +157,12 @@ def found_motion(contacts: ContactsConfig, first: Int[np.ndarray, "n"], beliefs:
     return bool(motion_accuracy(contacts, beliefs, question)[motion] >= best.low)
 
 
+def found_questions(contacts: ContactsConfig, played: Played, beliefs: Beliefs) -> list[str]:
+    """Questions whose first motion is the probes' best, or within the interval of its accuracy."""
+    found = lambda a: found_motion(contacts, played.choices[:, a, 0], beliefs, a)
+    return [name for a, name in enumerate(PROPERTIES) if found(a)]
+
+
 def seconds_picture(points: Mapping[str, Sequence[tuple[float, Interval]]]) -> Picture:
     """Accuracy over seconds of touch: plan → its (seconds, accuracy in %)."""
     series = [

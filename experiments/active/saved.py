@@ -173,11 +173,7 @@ def is_explorer(folder: Path) -> bool:
 
 
 def read_explorer(folder: Path) -> Explorer:
-    """The policy of a folder that `save_explorer` wrote.
-
-    Raises:
-      PolicyError: damaged, of another version, or of other sizes than this version makes.
-    """
+    """The policy of a folder that `save_explorer` wrote; `PolicyError` if it is damaged or of another version."""
     try:
         found = read_json(folder / CONFIG_FILE)
         if found["version"] != VERSION:

@@ -23,7 +23,7 @@ from experiments.active.arms import Arm, LearnerConfig, as_json, from_json, make
 from experiments.active.contacts import PROPERTIES
 from experiments.active.plans import NO_CHOICE, Played
 from experiments.active.policies import explore
-from experiments.active.report import found_motion
+from experiments.active.report import found_questions
 from experiments.active.world import TouchWorld, WorldConfig, make_world
 from experiments.core.context import Context, read_metrics
 from experiments.core.errors import ConfigurationError
@@ -32,11 +32,8 @@ from experiments.core.runner import Experiment
 from experiments.study.alarm_log import ALARM
 from touchr1_jax.models.active_policy import ActivePolicy
 
-ENOUGH = 4
-"""Questions of five whose motion a seed must find."""
-
-SHARE = 80.0
-"""Per cent of the seeds that must find so many."""
+ENOUGH = 4  # questions of five whose motion a seed must find
+SHARE = 80.0  # per cent of the seeds that must find so many
 
 NAME = "chosen"
 
@@ -69,17 +66,17 @@ def run(config: StabilityTouchConfig, context: Context) -> Results:
     """Train the policy of every seed, and see where it begins."""
     world = make_world(config.world, context)
     policy = make_policy(world, config.learner)
-    played: dict[int, Played] = {}
+    probes, played, found = world.probes.of(world.parts["test"]), dict[int, Played](), dict[int, list[str]]()
     for seed in context.each("seeds", range(config.first_seed, config.first_seed + config.seeds)):
         compute = functools.partial(_one_seed, world, policy, config, seed, context)
         played[seed] = from_json(context.once(f"played/{seed}", compute))[NAME]
-        context.print(f"seed {seed}: {', '.join(found_questions(world, played[seed]))} found")
-    found = {seed: found_questions(world, one) for seed, one in played.items()}
+        found[seed] = found_questions(config.world.contacts, played[seed], probes)
+        context.print(f"seed {seed}: {', '.join(found[seed])} found")
     alarms = alarms_of(context)
     return Results(
         verdict=(verdict(found, alarms),),
         requirements=requirements(found),
-        tables=(seed_table(world, played, alarms),),
+        tables=(seed_table(world, played, found, alarms),),
         settings={
             "choices": len(world.bank.choices),
             "objects": ", ".join(f"{name} {len(rows)}" for name, rows in world.parts.items()),
@@ -96,12 +93,6 @@ def _one_seed(
     warm = warm_params(world, policy, learner, config.contacts, seed, context)
     params = reinforced_params(world, policy, warm, learner, NAME, Arm(budget=1), seed, context)
     return as_json({NAME: explore(policy, params, world.bank, world.parts["test"], 1)})
-
-
-def found_questions(world: TouchWorld, played: Played) -> list[str]:
-    """Questions whose first motion is the probes' best, or within the interval of its accuracy."""
-    probes, setup = world.probes.of(world.parts["test"]), world.config.contacts
-    return [p for a, p in enumerate(PROPERTIES) if found_motion(setup, played.choices[:, a, 0], probes, a)]
 
 
 def alarms_of(context: Context) -> dict[int, dict[str, int]]:
@@ -134,17 +125,18 @@ def verdict(found: dict[int, list[str]], alarms: dict[int, dict[str, int]]) -> s
     )
 
 
-def seed_table(world: TouchWorld, played: dict[int, Played], alarms: dict[int, dict[str, int]]) -> Table:
+def seed_table(
+    world: TouchWorld, played: dict[int, Played], found: dict[int, list[str]], alarms: dict[int, dict[str, int]]
+) -> Table:
     """First motion by question in every seed, a star where it is not the probes'."""
     motions = [motion for _, motion, _ in world.config.contacts.choices]
     rows: list[dict[str, Any]] = []
     for seed, one in played.items():
-        found = found_questions(world, one)
         row: dict[str, Any] = {"seed": str(seed)}
         for a, name in enumerate(PROPERTIES):
             touched = [motions[c] for c in one.choices[:, a, 0] if c != NO_CHOICE]
             first = max(sorted(set(touched)), key=touched.count) if touched else "none"
-            row[name] = first if name in found else f"{first} *"
+            row[name] = first if name in found[seed] else f"{first} *"
         right, touches = 100 * float(one.right.mean()), float(one.contacts.mean())
         rows.append(row | {"right": right, "touches": touches, "alarms": " ".join(alarms.get(seed, {})) or "none"})
     return named_table(

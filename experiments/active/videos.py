@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from experiments.active.arms import TOUCHES, as_json, from_json
 from experiments.active.encoder import belief_scale, belief_tokens
 from experiments.active.plans import NO_CHOICE, Answer, Played, play, same_for_all, until_sure
 from experiments.active.policies import answerer, explore, part_of, reinforce, warm_up
@@ -26,14 +27,13 @@ from experiments.recordings.cross_validation import deal_folds
 from experiments.recordings.descriptions import SENSOR, DescribedVideos, describe_source
 from sensors_io.touches import families
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
-from touchr1_jax.models.active_policy import ActivePolicy, build_active_policy
+from touchr1_jax.models.active_policy import build_active_policy
 from touchr1_jax.models.description_policy import LANGUAGE, LEVELS
 from touchr1_jax.models.lm import DecoderConfig
-from touchr1_jax.rl.config import GRPOConfig, Norm, Paper
+from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.environment import TouchBank, TouchChoice
 from touchr1_jax.rl.touch_reward import Prices
 from touchr1_jax.training.kernel_probe import KernelProbeConfig, cross_probe, object_weights
-from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import OptimizerConfig
 from touchr1_jax.training.train_sft import SFTConfig
 
@@ -86,9 +86,7 @@ class StoppingConfig:
         group=12,
         micro_prompts=24,
         lr_scale=1000.0,
-        algorithm=Paper(
-            beta=0.02, kl="exact", gamma=0.0, constrained=True, enumerated=Norm.STD, learn_conclusion=False
-        ),
+        algorithm=TOUCHES,
     )
     steps: int = 80
     seed: int = 0
@@ -111,11 +109,7 @@ class VideoWorld:
 
 
 def read_videos(config: StoppingConfig, source: Path, context: Context) -> VideoWorld:
-    """The labelled objects of PhysiCLeAR's layout that have enough videos.
-
-    Raises:
-      ConfigurationError: fewer objects than folds.
-    """
+    """The labelled objects of PhysiCLeAR's layout that have enough videos."""
     return world_of(config, describe_source(source, config.frames, context).labelled())
 
 
@@ -155,8 +149,7 @@ def stopping(config: StoppingConfig, source: Path, context: Context) -> tuple[Ta
     folds: list[Mapping[str, Played]] = []
     for k in context.each("folds of videos", range(config.folds)):
         compute = functools.partial(_fold, config, world, k, context)
-        saved = context.once(f"videos/{k}", compute)
-        folds.append({name: Played(**{f: np.array(x) for f, x in one.items()}) for name, one in saved.items()})
+        folds.append(from_json(context.once(f"videos/{k}", compute)))
     played = {name: _joined([fold[name] for fold in folds]) for name in folds[0]}
     return video_table(world, played), video_picture(config, played)
 
@@ -184,23 +177,14 @@ def _fold(config: StoppingConfig, world: VideoWorld, k: int, context: Context) -
             config.videos,
             Prices(second=jnp.float32(price), harm=jnp.float32(0.0)),
             0.0,
-            LoopConfig(steps=config.steps, save_every=max(1, config.steps)),
+            config.steps,
             context,
             f"videos/grpo/{price:g}/{k}",
             config.seed,
         )
-        found[f"{CHOSEN} at {price:g}"] = _explored(policy, params, bank, tested, config.videos, answer)
-    return {
-        name: {f: getattr(one, f).tolist() for f in ("right", "seconds", "harm", "choices")}
-        for name, one in found.items()
-    }
-
-
-def _explored(
-    policy: ActivePolicy, params: Any, bank: TouchBank, tested: np.ndarray, budget: int, answer: Answer
-) -> Played:
-    """Touches of a policy, answered by the warm start as the controls are."""
-    return play(bank, tested, explore(policy, params, bank, tested, budget).choices, answer)
+        touches = explore(policy, params, bank, tested, config.videos).choices
+        found[f"{CHOSEN} at {price:g}"] = play(bank, tested, touches, answer)  # by the warm start, as the controls
+    return as_json(found)
 
 
 def controls_of(

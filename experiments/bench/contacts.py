@@ -18,8 +18,7 @@ from touchr1_jax.bench.questions.thresholds import fit_thresholds
 def read_source(store: RecordStore, after_each: Callable[[], None] = lambda: None) -> BenchSource:
     """Measure the contacts of the test and of the training split; `after_each` is called after every contact.
 
-    Raises:
-      ContactError: no labelled test contact, or too few training contacts to fit thresholds on.
+    `ContactError` without a labelled test contact, or with too few training contacts to fit thresholds on.
     """
     bench, train = measure_split(store, "test", after_each), measure_split(store, "train", after_each)
     if not bench.objects():

@@ -16,16 +16,7 @@ import dataclasses
 
 import numpy as np
 
-from experiments.bench.paper_checks import (
-    StatementCheck,
-    best_weighting,
-    columns_as_scores,
-    confirmed,
-    error_and_distance,
-    gain_interval,
-    impossible_distances,
-    inconsistencies,
-)
+from experiments.bench import paper_checks
 from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context
 from experiments.core.look import PALETTE, SHARED
@@ -48,7 +39,7 @@ class PaperAuditConfig:
 def run(config: PaperAuditConfig, context: Context) -> Results:
     """Compute every check."""
     del context
-    wrong, right = inconsistencies(), confirmed()
+    wrong, right = paper_checks.inconsistencies(), paper_checks.confirmed()
     unseen, failed = (sum((c.verdict == "holds") == holds for c in cs) for cs, holds in ((wrong, True), (right, False)))
     count = {name: sum(c.verdict == name for c in wrong) for name in ("contradiction", "unsupported", "not given")}
     return Results(
@@ -85,14 +76,14 @@ def run(config: PaperAuditConfig, context: Context) -> Results:
     )
 
 
-def _statement_table(title: str, checks: tuple[StatementCheck, ...]) -> Table:
+def _statement_table(title: str, checks: tuple[paper_checks.StatementCheck, ...]) -> Table:
     statement = lambda c: {"statement, and where": f"{c.title} ({c.where})", "verdict": c.verdict}
     return named_table(title, [statement(c) | {"published": c.published, "recomputed": c.recomputed} for c in checks])
 
 
 def _average_table() -> Table:
-    low, high, average = columns_as_scores()
-    weights, _ = best_weighting()
+    low, high, average = paper_checks.columns_as_scores()
+    weights, _ = paper_checks.best_weighting()
     rows: list[dict[str, Cell]] = [
         {"model": name, "printed": float(a), "mean of nine": float(m.mean()), "best weights": float(m @ weights)}
         for name, a, m in zip(paper.MAIN, average, (low + high) / 2, strict=True)
@@ -108,10 +99,10 @@ def _average_table() -> Table:
 
 
 def _distance_table() -> Table:
-    impossible = impossible_distances()
+    impossible = paper_checks.impossible_distances()
     rows: list[dict[str, Cell]] = [
         {"row": name, "1 − Acc": error, "OMAE": omae, "possible": name not in impossible}
-        for name, (error, omae) in error_and_distance().items()
+        for name, (error, omae) in paper_checks.error_and_distance().items()
     ]
     meanings = {"1 − Acc": "of the mean of H-, R- and P-Acc: least possible OMAE"}
     return named_table("OMAE and its bound", rows, formats={"1 − Acc": ".3f", "OMAE": ".2f"}, meanings=meanings)
@@ -121,7 +112,7 @@ def _vtv_table(config: PaperAuditConfig) -> Table:
     rows: list[dict[str, Cell]] = []
     ours, theirs = paper.VTV["Ours"][0][:5], paper.VTV["VTV-LLM-7B"][0][:5]
     for column, a, b in zip(paper.VTV_COLUMNS[:5], ours, theirs, strict=True):
-        gain, half, p = gain_interval(a, b, config.vtv_items)
+        gain, half, p = paper_checks.gain_interval(a, b, config.vtv_items)
         span = f"[{gain - half:.1f}, {gain + half:.1f}]"
         rows.append({"property": column, "Touch-R1": a, "VTV-LLM": b, "gain": gain, "95 %": span, "p": p})
     return named_table(
@@ -135,11 +126,11 @@ def _vtv_table(config: PaperAuditConfig) -> Table:
 
 def distance_chart() -> bytes:
     """OMAE over the error rate of the same row; no answers can lie below the diagonal."""
-    impossible, ends = impossible_distances(), np.array([0.25, 0.75])
+    impossible, ends = paper_checks.impossible_distances(), np.array([0.25, 0.75])
     diagonal = Series("OMAE = 1 − Acc; below it is impossible", x=ends, y=ends, marker="", line=":", colour=SHARED)
     shaded = Series(x=ends, y=ends, low=[0, 0], band=True, marker="", line="", colour=PALETTE[1], alpha=0.4)
     series = [shaded, diagonal]
-    every = error_and_distance()
+    every = paper_checks.error_and_distance()
     for table, marker in (("main table", "o"), ("ablation", "D")):
         rows = {name: row for name, row in every.items() if name.endswith("(ablation)") == (table == "ablation")}
         x, y = zip(*rows.values(), strict=True)
@@ -152,7 +143,7 @@ def distance_chart() -> bytes:
 
 def average_chart() -> bytes:
     """Printed Avg and the plain mean of the nine columns, for every model."""
-    low, high, average = columns_as_scores()
+    low, high, average = paper_checks.columns_as_scores()
     mean = ((low + high) / 2).mean(1)
     joined = Series(
         x=average, low=np.minimum(average, mean), high=np.maximum(average, mean), marker="", colour="#cfd4da"

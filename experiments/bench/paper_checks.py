@@ -16,16 +16,14 @@ from touchr1_jax.bench.statistics import wilson_interval
 
 Verdict = Literal["contradiction", "not given", "unsupported", "holds"]
 
-MainTable = Mapping[str, tuple[paper.Row, float]]
-"""Model → the nine columns of the main table, and Avg."""
+MainTable = Mapping[str, tuple[paper.Row, float]]  # model → the nine columns of the main table, and Avg
 
 OURS = "Touch-R1-7B"
 
 SHARE_ROUNDING, LEVEL_ROUNDING = 0.05, 0.005
 """Half of the last digit of a percentage, and of OMAE and ρ."""
 
-SOLVER_ERROR = 1e-6
-"""Points; a smaller miss counts as none."""
+SOLVER_ERROR = 1e-6  # Points; a smaller miss counts as none
 
 SAME_MODELS = {"Qwen2.5-VL-7B": "Qwen2.5-VL-7B", OURS: "Touch-R1"}
 """Models of the main table → their names in the ablation tables."""
@@ -59,11 +57,7 @@ def best_weighting(main: MainTable = paper.MAIN) -> tuple[np.ndarray, float]:
 
 
 def perfect_average(main: MainTable = paper.MAIN) -> float:
-    """The largest Avg 100 Σ w of a perfect model under any weights w ≥ 0 that give every printed Avg; a mean gives 100.
-
-    Raises:
-      ValueError: no weights give every Avg.
-    """
+    """The largest Avg 100 Σ w of a perfect model under weights w ≥ 0 that give every printed Avg; a mean has 100."""
     low, high, average = columns_as_scores(main)
     limits = np.concatenate([average + SHARE_ROUNDING, SHARE_ROUNDING - average])
     found = optimize.linprog(-np.ones(low.shape[1]), A_ub=np.concatenate([low, -high]), b_ub=limits)

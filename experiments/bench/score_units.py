@@ -13,22 +13,13 @@ from touchr1_jax.bench.items import read_items
 from touchr1_jax.bench.json_lines import read_lines
 from touchr1_jax.bench.questions.answers import average_line, metric_rows, parsed_share, read_answers
 
-SCORES = "scores"
-"""Folder of the cache that holds them."""
+SCORES = "scores"  # folder of the cache that holds them
 
 
 def score_units(
     items: Path, answers: Sequence[Path], by_sight: Path | None, cache_dir: Path
 ) -> dict[Path, tuple[WorkUnit, Path]]:
-    """File of answers → the unit that scores it, and where its scores are when it is done.
-
-    Args:
-      items, answers, by_sight: files of questions and of answers.
-      cache_dir: where the scores are kept.
-
-    Raises:
-      ItemError, LinesError: a file that is not there, or other than it must be.
-    """
+    """File of answers → the unit that scores it, and where its scores are when it is done."""
     asked, listed = read_items(items), {}
     for path in (*answers, *([by_sight] if by_sight else [])):
         read_answers(read_lines(path), asked, str(path))

@@ -50,8 +50,7 @@ MOTIONS = ("slide_x", "hold")
 FUSED, WITH_FORCE = "all sensors", "all sensors and force"
 FORCE, SHAPE, PRIOR = "force alone", "true shape", "commonest"
 
-Scored = Mapping[str, Mapping[str, Interval]]
-"""Predictor → task, and "average"."""
+Scored = Mapping[str, Mapping[str, Interval]]  # predictor → task, and "average"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -115,11 +114,7 @@ def run(config: VTVProtocolConfig, context: Context) -> Results:
 
 
 def one_each(scenes: LiveScenes) -> dict[str, list[int]]:
-    """The first contact of every motion with each object that has one of all, objects in the same order.
-
-    Raises:
-      DataError: no object has one of each.
-    """
+    """The first contact of every motion with each object that has one of all, objects in the same order."""
     by_object = lambda rows: {scenes.contacts[row].object_id: row for row in reversed(rows)}
     first: dict[str, dict[str, int]] = {name: by_object(contacts_of(scenes, name)) for name in MOTIONS}
     shared = sorted(set.intersection(*(set(rows) for rows in first.values())))
@@ -160,12 +155,6 @@ def predictions(
         **{source: found[source] for source in (*SENSORS, FORCE, SHAPE)},
         PRIOR: vtv.prior_log_probs(made.label),
     }
-
-
-def half_width(share: float, questions: int) -> float:
-    """1.96 √(p (1 − p) / n) in points, of a share in percent over n independent questions."""
-    p = share / 100
-    return 196 * math.sqrt(p * (1 - p) / questions)
 
 
 def verdict(scored: Scored) -> tuple[str, ...]:
@@ -220,14 +209,14 @@ MEANINGS: Mapping[str, str] = {
 
 def task_table(counts: Mapping[str, int], scored: Mapping[str, Interval]) -> Table:
     """Meaning, questions and chance of each task, and the interval that the benchmark's size would give its share."""
-    width = f"± of {paper.VTV_ITEMS}"
+    width, deviation = f"± of {paper.VTV_ITEMS}", lambda p: math.sqrt(p * (1 - p) / paper.VTV_ITEMS)
     rows: list[dict[str, Cell]] = [
         {
             "task": task,
             "asks for": MEANINGS[task],
             "questions": counts[task],
             "chance": CHANCE[task],
-            width: half_width(scored[task].mean, paper.VTV_ITEMS),
+            width: 196 * deviation(scored[task].mean / 100),
         }
         for task in VTV
     ]

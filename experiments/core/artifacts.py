@@ -6,6 +6,7 @@ bit on a disk raises no error of its own.  Files without this key, such as those
 
 import dataclasses
 import enum
+import io
 import json
 import math
 import os
@@ -58,11 +59,7 @@ def jsonable(value: Any, where: str = "value") -> Any:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Publish a file atomically: write a temporary sibling, flush it to the disk, then put it in its place.
-
-    Raises:
-      UnwrittenError: it did not reach the disk.
-    """
+    """Publish a file by way of a flushed temporary sibling; `UnwrittenError` if it does not reach the disk."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
@@ -84,6 +81,13 @@ def write_text(path: Path, text: str) -> None:
     write_bytes(path, text.encode())
 
 
+def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = False) -> None:
+    """Publish arrays as one NumPy file, atomically."""
+    buffer = io.BytesIO()
+    (np.savez_compressed if compressed else np.savez)(buffer, **arrays)
+    write_bytes(path, buffer.getvalue())
+
+
 def write_json(path: Path, value: Any) -> None:
     """Publish a value as indented JSON, atomically."""
     write_text(path, json.dumps(jsonable(value), indent=2, ensure_ascii=False) + "\n")
@@ -95,11 +99,7 @@ def write_sealed(path: Path, value: Any) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """The value of a JSON file, without its checksum.
-
-    Raises:
-      DamagedFileError: it holds no JSON, or its checksum does not hold.
-    """
+    """The value of a JSON file, without its checksum; `DamagedFileError` if either does not hold."""
     try:
         return unseal(path.read_text(encoding="utf-8"))
     except ValueError as error:
@@ -109,11 +109,7 @@ def read_json(path: Path) -> Any:
 
 
 def point_link(link: Path, target: str) -> None:
-    """Make `link` a symbolic link to `target`, replacing an older link atomically.
-
-    Raises:
-      FileExistsError: something that is no link is in the way.
-    """
+    """Make `link` a symbolic link to `target`, replacing an older link, and nothing else, atomically."""
     if link.exists() and not link.is_symlink():
         raise FileExistsError(f"{link} is no symbolic link, so it is not replaced; move it away")
     temporary = link.with_name(f".{link.name}.{os.getpid()}")

@@ -39,8 +39,7 @@ LONG_AXIS = 300.0
 ITERATIONS = 200
 """Of the placement of labels; a limit in seconds would make a picture depend on the machine."""
 
-Values = Sequence[float] | np.ndarray
-"""Numbers [N]."""
+Values = Sequence[float] | np.ndarray  # numbers [N]
 
 Scale = Literal["linear", "log", "symlog"]
 Better = Literal["lower", "higher"]
@@ -212,8 +211,7 @@ def bars(
     return draw([panel])
 
 
-Point = tuple[str, float, float, float]
-"""Name, ms a frame, median error, 95th percentile of the error."""
+Point = tuple[str, float, float, float]  # name, ms a frame, median error, 95th percentile of the error
 
 
 def speed_against_error(

@@ -27,14 +27,9 @@ USAGE = f"""usage: {PROG} NAME [--scale smoke|default|…] [--fresh] [--tensorbo
        {PROG} demo [POLICY]          ask in the browser
 """
 
-ASKING = ("ask", "export", "demo")
-"""Commands on trained policies, which `experiments.ask` defines."""
-
-SWEEP = "sweep"
-"""Command that `experiments.core.sweep` defines."""
-
-COMMANDS = ("list", "new", "compare", SWEEP, "show", *ASKING)
-"""Names that no experiment can have."""
+ASKING = ("ask", "export", "demo")  # commands on trained policies, which `experiments.ask` defines
+SWEEP = "sweep"  # command that `experiments.core.sweep` defines
+COMMANDS = ("list", "new", "compare", SWEEP, "show", *ASKING)  # names that no experiment can have
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -19,11 +19,8 @@ The most important is the first."""
 
 GRAVITY = get_args(Verdict)
 
-ABSENT_IN = "only in"
-"""Begins the verdict on a figure that some runs lack."""
-
-CHANCE = 0.05
-"""Rate at which a 95 % interval of no difference excludes 0."""
+ABSENT_IN = "only in"  # begins the verdict on a figure that some runs lack
+CHANCE = 0.05  # rate at which a 95 % interval of no difference excludes 0
 
 
 class ComparisonError(ValueError):
@@ -46,8 +43,7 @@ class ComparedFigure(NamedTuple):
 def compare_runs(runs: Sequence[PastRun], most: int) -> str:
     """Compare runs as text: runs, differing settings, at most `most` figures that differ, shared ones first, cost.
 
-    Raises:
-      ComparisonError: fewer than two runs, the same run twice, an unfinished run, or runs without a common figure.
+    `ComparisonError` for fewer than two runs, one named twice, an unfinished one, or runs without a common figure.
     """
     if len(runs) < 2:
         raise ComparisonError(f"{len(runs)} run is named: must be at least two; name another")

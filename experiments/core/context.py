@@ -9,10 +9,11 @@ import json
 import os
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 from rich.console import Console
 
 from experiments.core.artifacts import (
@@ -20,11 +21,13 @@ from experiments.core.artifacts import (
     UnwrittenError,
     jsonable,
     read_json,
+    write_arrays,
     write_sealed,
     write_text,
 )
 from experiments.core.progress import Advance, Loop, ProgressCallback, TrainingSample, Watcher, show_progress
 from experiments.core.stopping import Stopping
+from sensors_io.arrays import ArraysError, load_arrays
 from sensors_io.json_files import CHECKSUM, seal, unseal
 from sensors_io.units import HERE, Launcher
 from touchr1_jax.distributed.processes import SINGLE_PROCESS, ProcessGroup, SingleDevice
@@ -61,11 +64,7 @@ class MetricLog:
             watcher.rewound(stage, step)
 
     def append(self, stage: str, step: int, scalars: dict[str, Any]) -> None:
-        """Add one line and flush it.
-
-        Raises:
-          ValueError: a scalar is not finite, or takes the name of a field.
-        """
+        """Add one line and flush it; `ValueError` for a scalar that is not finite or takes the name of a field."""
         taken = {"stage", "step", CHECKSUM} & set(scalars)
         if taken:
             raise ValueError(f"scalars holds {sorted(taken)}: these are fields of every line; rename them")
@@ -209,11 +208,7 @@ class Context:
             yield report
 
     def require_logged(self, stage: str, steps: int) -> None:
-        """Require that the log has every step before a checkpoint, so that no run ends with a part of its log.
-
-        Raises:
-          DamagedFileError: a line is missing.
-        """
+        """`DamagedFileError` unless the log has every step before a checkpoint: no run ends with a part of it."""
         if steps == 0 or not self.processes.writes:
             return
         seen = {row["step"] for row in read_metrics(self.directory) if row["stage"] == stage}
@@ -249,12 +244,7 @@ class Context:
         self.processes.write_once(lambda: write_sealed(self._stage_file(stage), content))
 
     def load_stage(self, stage: str) -> Any:
-        """The saved result of a finished stage, in JSON's types.
-
-        Raises:
-          FileNotFoundError: the stage is not done.
-          DamagedFileError: its result is damaged.
-        """
+        """The saved result of a finished stage, in JSON's types; `FileNotFoundError` if the stage is not done."""
         path = self._stage_file(stage)
         if not path.exists():
             raise FileNotFoundError(f"stage {stage!r} has no result at {path}: finish and save the stage first")
@@ -265,6 +255,19 @@ class Context:
         if not self.done(stage):
             self.save_stage(stage, compute())
         return self.load_stage(stage)
+
+    def cached_arrays(
+        self, name: str, make: Callable[[], Mapping[str, Any]], *, compressed: bool = False
+    ) -> dict[str, np.ndarray]:
+        """The arrays in `name`.npz of the cache, made first where it is missing, and again where it is damaged."""
+        path = self.cache_dir / f"{name}.npz"
+        if path.exists():
+            try:
+                return load_arrays(path)
+            except ArraysError as error:
+                self.print(f"{error}: it is made again")
+        write_arrays(path, make(), compressed=compressed)
+        return load_arrays(path)
 
     @contextlib.contextmanager
     def timed(self, stage: str) -> Iterator[None]:

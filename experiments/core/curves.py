@@ -12,8 +12,7 @@ from experiments.core.look import MARKERS, SHARED, colours
 from experiments.core.results import Estimate
 from touchr1_jax.bench.metrics import METRICS
 
-MOST_POINTS = 160
-"""Of a drawn line: a panel is as many points wide."""
+MOST_POINTS = 160  # of a drawn line: a panel is as many points wide
 
 POINTS_OF_CHART = 25_000
 """Of all lines of a chart, so that its SVG stays under a megabyte; a line keeps at least `FEWEST_POINTS`."""
@@ -32,8 +31,7 @@ WORDS = {
 }
 """Scalar → its name in a chart, where that of the log says too little."""
 
-Curve = tuple[np.ndarray, np.ndarray]
-"""Steps and values of one logged scalar of one stage."""
+Curve = tuple[np.ndarray, np.ndarray]  # steps and values of one logged scalar of one stage
 
 
 def curves_by_phase(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[tuple[str, str], Curve]]]:
@@ -150,11 +148,7 @@ def _point(name: str, row: Mapping[str, Estimate], colour: str, marker: str) -> 
 
 
 def running_mean(values: np.ndarray) -> np.ndarray:
-    """Centred mean over a twentieth of the points, the window cut off at the ends.
-
-    Args:
-      values: float [n].
-    """
+    """Centred mean of values [n] over a twentieth of them, the window cut off at the ends."""
     half = len(values) // 40
     total = np.concatenate([[0.0], np.cumsum(values)])
     low = np.maximum(np.arange(len(values)) - half, 0)

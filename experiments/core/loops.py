@@ -14,8 +14,7 @@ from touchr1_jax.training.loop import SKIPPED, Batches, Hooks, Log, LoopConfig, 
 STEPPING, WAITING = "in steps", "waiting for data"
 """Names in `timing` of the steps after the first and of their waiting for a batch, each followed by `/STAGE`."""
 
-COMPILING = "compiling the first step"
-"""Note beside the bar of a stage until its first step is done."""
+COMPILING = "compiling the first step"  # note beside the bar of a stage until its first step is done
 
 MakeLog = Callable[[Context, str, int], Log]
 """From the run, a stage and its first step to what receives (step, metrics)."""
@@ -84,11 +83,7 @@ def stage_hooks(
 
 
 def left_out_tables(lines: Iterable[Mapping[str, Any]]) -> tuple[Table, ...]:
-    """A table of the updates and groups that training left out because a number was not finite, if there were any.
-
-    Args:
-      lines: those of `metrics.jsonl`.
-    """
+    """A table of the updates and groups that training left out for a number that was not finite, if there were any."""
     stages: dict[str, list[Mapping[str, Any]]] = {}
     for line in lines:
         stages.setdefault(line["stage"], []).append(line)

@@ -18,11 +18,7 @@ RESERVED_BYTES, CORE_BYTES = round(0.8 * GIB), GIB // 16
 def require_memory(parts: Mapping[str, int]) -> str:
     """One line about the memory that a run needs on the host and what is free.
 
-    Args:
-      parts: bytes by purpose, besides libraries and compiler.
-
-    Raises:
-      MachineError: the process may not have so much (`ulimit -v`).
+    `parts` are bytes by purpose, besides libraries and compiler; `MachineError` if the process may not have so much.
     """
     parts = {BASE: BASE_BYTES, **parts}
     need = sum(parts.values())

@@ -14,11 +14,8 @@ from experiments.core.artifacts import write_text
 DICTIONARY = Path("touchr1_jax/rewards/__init__.py")
 """The file with an import and an entry for every reward."""
 
-EXAMPLES = Path("tests/touchr1_jax/rewards/examples.py")
-"""Answers and targets of the tests of rewards."""
-
-_MAKER = "make_rewards"
-"""The function that returns the dictionary."""
+EXAMPLES = Path("tests/touchr1_jax/rewards/examples.py")  # answers and targets of the tests of rewards
+_MAKER = "make_rewards"  # the function that returns the dictionary
 
 _ANSWER = "<perceive> xense soft </perceive> <compare> soft </compare> <conclude> soft </conclude>"
 """An answer to try a reward on."""
@@ -31,13 +28,8 @@ class NewError(ValueError):
 def write_new(root: Path, name: str, *, reward: bool, taken: Collection[str]) -> tuple[list[Path], list[Path]]:
     """Write an experiment; with `reward` also a reward, its test, and its two lines in the dictionary.
 
-    Everything is checked before the first file is written; if one cannot be written, the others are removed.
-
-    Returns:
-      the new files and the changed ones, relative to the top of the checkout, `root`.
-
-    Raises:
-      NewError: a name that is no lower-case Python name or taken, a file that exists, or no checkout.
+    Everything is checked before the first file is written; if one cannot be written, the others are removed.  Returns
+    the new files and the changed ones, relative to the top of the checkout; `NewError` says what is in the way.
     """
     if re.fullmatch("[a-z][a-z0-9_]*", name) is None or keyword.iskeyword(name):
         raise NewError(f"name is {name!r}: must be a lower-case Python name such as 'short_answers'; rename it")
@@ -88,11 +80,7 @@ def next_steps(name: str, *, reward: bool) -> list[str]:
 
 
 def with_entry(source: str, name: str) -> str:
-    """The dictionary's source with the import and the entry of one more reward.
-
-    Raises:
-      NewError: a reward of that name is there, or the source has another form than expected.
-    """
+    """The dictionary's source with the import and the entry of one more reward; `NewError` if it does not fit."""
     tree = ast.parse(source)
     imports = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
     ours = [node for node in imports if str(node.module).startswith("touchr1_jax.rewards.")]

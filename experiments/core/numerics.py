@@ -45,11 +45,7 @@ HARMLESS = ("--xla_force_host_platform_device_count", "--xla_dump", "--xla_hlo_p
 
 
 def require_supported() -> None:
-    """Refuse settings that no experiment runs with.
-
-    Raises:
-      ConfigurationError: one of them is on.
-    """
+    """Refuse settings that no experiment runs with."""
     for name, why in UNSUPPORTED.items():
         if jax.config.values[name]:
             raise ConfigurationError(f"{name} is True: must be False, since {why}; unset {name.upper()}")
@@ -68,15 +64,7 @@ def settings() -> dict[str, Any]:
 
 
 def require_same(before: Mapping[str, Any] | None, where: object) -> None:
-    """Refuse to continue a run under other settings than those that it began with.
-
-    Args:
-      before: the settings in its `config.json`; `None` for a run of an earlier version, which recorded none.
-      where: its directory.
-
-    Raises:
-      ConfigurationError: they differ.
-    """
+    """Refuse to continue a run in `where` under other settings than it began with; older runs recorded none."""
     found = () if before is None else changed(before, settings())
     if found:
         raise ConfigurationError(

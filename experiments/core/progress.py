@@ -21,8 +21,7 @@ from rich.text import Text
 
 from experiments.core.text import duration
 
-PLAIN_EVERY_S = 10.0
-"""Seconds between two plain lines."""
+PLAIN_EVERY_S = 10.0  # seconds between two plain lines
 
 
 class Advance(Protocol):
@@ -137,13 +136,9 @@ class Watcher:
 def show_progress(
     console: Console, loop: Loop, after: Callable[[], None] = lambda: None, *, every_s: float = PLAIN_EVERY_S
 ) -> Iterator[Advance]:
-    """Show the progress of one loop.
+    """Show the progress of a loop and call `after` each advance.
 
-    Args:
-      console: a terminal gets a live bar, anything else a line every `every_s` seconds and one at the end.
-      loop: advanced by the function that this yields.
-      after: called after each advance.
-      every_s: see `console`.
+    A terminal gets a live bar, anything else a line every `every_s` seconds and one at the end.
     """
     with (_bar if console.is_terminal else _plain_lines)(console, loop, every_s) as show:
 

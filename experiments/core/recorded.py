@@ -28,8 +28,7 @@ RECORDED = Path("experiments/recorded")
 
 BEGIN, END = "<!-- results: `python -m experiments.core.recorded fill` writes this table -->", "<!-- /results -->"
 
-TABLE = "table.md"
-"""File in it with the rows: subject, figures, experiment."""
+TABLE = "table.md"  # file in it with the rows: subject, figures, experiment
 
 _ABSOLUTE = re.compile(r"(?:/[\w.+ -]+){2,}/?|[A-Za-z]:\\\S+")
 _FIGURE = re.compile(r"\{([^{}|]+)\|([^{}|]+)\}")
@@ -41,11 +40,7 @@ class FigureError(ValueError):
 
 
 def record(run: Path, root: Path = ROOT) -> Path:
-    """Keep the results of a finished run; they replace those of an earlier run of the experiment.
-
-    Raises:
-      FigureError: the run is not finished.
-    """
+    """Keep the results of a finished run in place of those of an earlier one; `FigureError` if it is not finished."""
     if not (run / "results.json").exists():
         raise FigureError(f"run is {run}: holds no results.json; finish it first")
     results = read_json(run / "results.json")
@@ -64,11 +59,7 @@ def _placeless(value: Any) -> Any:
 
 
 def show_recorded(name: str, module: str, runs_dir: Path) -> tuple[str, ...]:
-    """Write the recorded results of an experiment, which a module defines, as its report; the lines to print.
-
-    Raises:
-      FigureError: no run of it is recorded.
-    """
+    """Write the recorded results of an experiment as its report; the lines to print, `FigureError` without any."""
     found, folder = _read(name, ROOT), runs_dir / name / "recorded"
     source = ROOT / Path(*module.split(".")).with_suffix(".py")
     about = ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))) or name
@@ -90,11 +81,7 @@ def _read(name: str, root: Path) -> Mapping[str, Any]:
 
 
 def filled(text: str, root: Path = ROOT) -> str:
-    """A document with the table between `BEGIN` and `END` as the runs recorded in a checkout have it.
-
-    Raises:
-      FigureError: no such block, or a figure whose run, key or format is unknown.
-    """
+    """A document with the table between `BEGIN` and `END` by the recorded runs; `FigureError` names what is unknown."""
     before, begin, rest = text.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end:
@@ -108,11 +95,7 @@ def filled(text: str, root: Path = ROOT) -> str:
 
 
 def figure(name: str, path: str, spec: str, root: Path = ROOT) -> str:
-    """A figure of a recorded run, such as `requirements > least gain from touch > measured` with format `.0f`.
-
-    Raises:
-      FigureError: an unknown run or key, or a value that has no such format.
-    """
+    """A figure of a recorded run, such as `requirements > least gain from touch > measured` with format `.0f`."""
     value = value_at(_read(name, root), path)
     try:
         return number(value, spec)
@@ -121,11 +104,7 @@ def figure(name: str, path: str, spec: str, root: Path = ROOT) -> str:
 
 
 def value_at(run: Mapping[str, Any], path: str) -> Any:
-    """The value at a path in the results of a run.
-
-    Raises:
-      FigureError: an unknown key.
-    """
+    """The value at a path in the results of a run; `FigureError` for an unknown key."""
     value: Any = run
     for key in map(str.strip, path.split(">")):
         entries = _entries(value)

@@ -23,11 +23,7 @@ from touchr1_jax.bench.scoring import REPORTED
 def write_report(directory: Path, results: Results, *, about: str, description: Mapping[str, Any]) -> Path:
     """Write `report.html` and the pictures in `plots/` of a run and return the path of the report.
 
-    Args:
-      directory: the run's; its `metrics.jsonl` holds the curves.
-      results: of the run.
-      about: docstring of the experiment; its first line is the question.
-      description: content of the run's `config.json`.
+    `about` is the docstring of the experiment, `description` the content of the run's `config.json`.
     """
     colour, settings = colours(results.arms), dict(results.settings)
     smoke = description["scale"] == SMOKE

@@ -11,14 +11,12 @@ from experiments.core.artifacts import jsonable
 from experiments.core.errors import require
 from touchr1_jax.bench.scoring import REPORTED
 
-SETTINGS = ("preset", "lr_scale")
-"""Settings without which no report can be read."""
+SETTINGS = ("preset", "lr_scale")  # settings without which no report can be read
 
 Slot = tuple[int, int, str]
 """Start, end and segment (`perceive`, `compare` or `conclude`) of a piece of a trace."""
 
-Cell = str | float | int | bool | None
-"""What a table holds; `None` where nothing was measured."""
+Cell = str | float | int | bool | None  # what a table holds; `None` where nothing was measured
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -162,11 +160,7 @@ class Comparison(_Ci95):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Trace:
-    """A text and its parsed pieces, in order and disjoint.
-
-    Raises:
-      ResultsError: pieces that overlap, are out of order or end past the text.
-    """
+    """A text and its parsed pieces, which must be in order, disjoint and end with the text at the latest."""
 
     text: str
     slots: tuple[Slot, ...]
@@ -291,11 +285,7 @@ class Results:
                 require(ok, f"{field}.{name}", share, "must lie in [0, 1]", "correct it")
 
     def to_json(self, description: Mapping[str, Any]) -> dict[str, Any]:
-        """The content of `results.json`.
-
-        Args:
-          description: that of the run's `config.json`: `experiment`, `scale`, `config` and `git`.
-        """
+        """The content of `results.json`; `description` is that of the run's `config.json`."""
         arms = ("arms", "baselines", "comparisons") if self.arms else ()
         names = (*arms, "verdict", "tables", "settings", "timing", "data")
         git = description["git"]

@@ -58,8 +58,7 @@ from touchr1_jax.training.compilation import compilations_kept, compiled_quickly
 from touchr1_jax.training.loop import NonFiniteGradientError
 from touchr1_jax.training.questions import NoLabelsError
 
-EVENTS = "events"
-"""Folder of a run that holds its TensorBoard events."""
+EVENTS = "events"  # folder of a run that holds its TensorBoard events
 
 HELP_ALL = "--help-all"
 
@@ -79,8 +78,7 @@ OF_RUNNER = (
 )
 """Options of every experiment."""
 
-MOST_OPTIONS, MOST_LETTERS = 10, 70
-"""Of short help: options, and letters about a group."""
+MOST_OPTIONS, MOST_LETTERS = 10, 70  # of short help: options, and letters about a group
 
 COMPILED = "compiled"
 """Folder of the cache for compiled programs, which later runs of the same shapes reuse."""
@@ -165,11 +163,7 @@ def run(arguments: Sequence[str], package: str = "experiments") -> int:
 
 
 def load(name: str, package: str = "experiments") -> tuple[Experiment[Any], str]:
-    """An experiment of a package and its docstring.
-
-    Raises:
-      ValueError: its module names it otherwise.
-    """
+    """An experiment of a package and its docstring."""
     module = importlib.import_module(find(package)[name].module)
     if module.EXPERIMENT.name != name:
         raise ValueError(
@@ -179,37 +173,32 @@ def load(name: str, package: str = "experiments") -> tuple[Experiment[Any], str]
 
 
 def run_experiment(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> int:
-    """Run or continue an experiment; returns the exit code, 128 + n after signal n.
-
-    Args:
-      experiment: with its configurations.
-      arguments: of the command line after its name.
-      about: its docstring, whose first line is the question.
-    """
+    """Run or continue an experiment, whose docstring is `about`; returns the exit code, 128 + n after signal n."""
     try:
         command = parse(experiment, arguments, about)
         jsonable(command.config, where="config")
     except (ValueError, LauncherError) as error:  # a configuration refuses its own values, or one is not finite
         print_error(f"{type(error).__name__}: {error}")
         return 2
-    if at_url(command.runs_dir):
-        print_error(
-            f"runs-dir is {command.runs_dir}: must be a folder, for a run locks, appends to and replaces its files, "
-            "which no store can; name one, and afterwards `export` a policy to the URL"
-        )
-        return 2
-    for flag in watchers.PACKAGES:
-        if getattr(command, flag) and (hint := watchers.missing(flag)):
-            print_error(hint)
-            return 2
-    if not experiment.spreads and (command.launch != Launch() or command.launcher != HERE):
-        print_error(f"{experiment.name} runs in one process on one device; leave --distributed, --mesh, --launcher out")
-        return 2
-    if command.launch.distributed and command.launcher != HERE:
-        print_error("--distributed and --launcher both spread the run: leave one out")
+    if why := _refusal(experiment, command):
+        print_error(why)
         return 2
     with compiled_quickly() if command.scale in experiment.quick else contextlib.nullcontext():
         return _execute(experiment, command, about, shlex.join([*PROG.split(), experiment.name, *arguments]))
+
+
+def _refusal(experiment: Experiment[Any], command: Any) -> str:
+    """The reason why a command cannot run, and the fix; empty if it can."""
+    if at_url(command.runs_dir):
+        return (
+            f"runs-dir is {command.runs_dir}: must be a folder, for a run locks, appends to and replaces its files, "
+            "which no store can; name one, and afterwards `export` a policy to the URL"
+        )
+    if not experiment.spreads and (command.launch != Launch() or command.launcher != HERE):
+        return f"{experiment.name} runs in one process on one device; leave --distributed, --mesh, --launcher out"
+    if command.launch.distributed and command.launcher != HERE:
+        return "--distributed and --launcher both spread the run: leave one out"
+    return next(filter(None, (watchers.missing(flag) for flag in watchers.PACKAGES if getattr(command, flag))), "")
 
 
 def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> Any:

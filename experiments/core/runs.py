@@ -30,11 +30,8 @@ PACKAGES = ("touchr1-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint",
 FIELDS = frozenset({"experiment", "scale", "config", "git", "command"})
 """Fields in `config.json` of a run; that of a model has others."""
 
-UNKNOWN = "unknown"
-"""Commit of code outside a checkout."""
-
-ROOT = Path(__file__).resolve().parents[2]
-"""The checkout of this code, if there is one."""
+UNKNOWN = "unknown"  # commit of code outside a checkout
+ROOT = Path(__file__).resolve().parents[2]  # the checkout of this code, if there is one
 
 
 class RunInUse(RuntimeError):
@@ -104,12 +101,7 @@ def create(home: Path, description: dict[str, Any]) -> Path:
 def describe(
     name: str, scale: str, config: Any, command: str, *, settings: Mapping[str, Any], devices: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """The content of `config.json`: the resolved configuration and everything needed to run it again.
-
-    Args:
-      name, scale, config, command: of the experiment.
-      settings, devices: those of `numerics`.
-    """
+    """The content of `config.json`: the resolved configuration and everything needed to run it again."""
     return {
         "experiment": name,
         "scale": scale,
@@ -129,11 +121,7 @@ def point_latest(directory: Path) -> None:
 
 @contextlib.contextmanager
 def locked(directory: Path) -> Iterator[None]:
-    """Lock a run directory for this process; the lock ends with the process.
-
-    Raises:
-      RunInUse: another process has locked it.
-    """
+    """Lock a run directory for this process, until it ends; `RunInUse` if another process has locked it."""
     with (directory / ".lock").open("w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -163,11 +151,7 @@ def newest(home: Path, config: Any, *, finished: bool) -> Path | None:
 
 
 def read_description(directory: Path) -> dict[str, Any]:
-    """The content of `config.json` of a run.
-
-    Raises:
-      DamagedFileError: it is damaged, or not that of a run.
-    """
+    """The content of `config.json` of a run; `DamagedFileError` if it is damaged, or not that of a run."""
     path = directory / "config.json"
     found = read_json(path)
     if not _describes_run(found):
@@ -247,12 +231,7 @@ class PastRun:
 
 
 def read_run(directory: Path) -> PastRun:
-    """Read the directory of a run.
-
-    Raises:
-      FileNotFoundError: no `config.json`.
-      DamagedFileError: a damaged file, or not that of a run.
-    """
+    """Read the directory of a run; `FileNotFoundError` without a `config.json`, `DamagedFileError` if damaged."""
     path, times, results = (directory / f"{name}.json" for name in ("config", "timing", "results"))
     if not path.exists():
         raise FileNotFoundError(f"{directory} holds no config.json: must be the directory of a run; correct the path")
@@ -279,11 +258,7 @@ def _in_use(directory: Path) -> bool:
 
 
 def locate(name: str, runs_dir: Path) -> Path:
-    """Find the directory of a run by its path, by `NAME/STAMP`, or by `NAME` for the latest of an experiment.
-
-    Raises:
-      FileNotFoundError: there is none.
-    """
+    """Directory of a run by its path, by `NAME/STAMP`, or by `NAME` for the latest; `FileNotFoundError` without one."""
     for directory in (Path(name), Path(name) / "latest", runs_dir / name, runs_dir / name / "latest"):
         if (directory / "config.json").exists():
             return directory.resolve()

@@ -14,11 +14,8 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 PATIENCE = b"\nstopping once this step is done and saved; a second signal ends at once, unsaved\n"
 """Written to standard error where a stop has to wait; a step that compiles takes minutes."""
 
-STDERR = 2
-"""Its descriptor; a replacement of `sys.stderr`, as in a notebook, may have none."""
-
-AGAIN_S = 0.02
-"""Interval of the checks whether the raised `Stopped` still propagates."""
+STDERR = 2  # its descriptor; a replacement of `sys.stderr`, as in a notebook, may have none
+AGAIN_S = 0.02  # interval of the checks whether the raised `Stopped` still propagates
 
 
 class Stopped(BaseException):

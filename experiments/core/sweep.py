@@ -34,16 +34,14 @@ from sensors_io.errors import UserError
 from sensors_io.units import HERE, Launcher, LauncherError, UnitsError, WorkUnit, finish
 from touchr1_jax.bench.scoring import REPORTED
 
-FOLDERS = "sweeps"
-"""Folder of the sweeps in the folder of all runs."""
+FOLDERS = "sweeps"  # folder of the sweeps in the folder of all runs
 
 DIGITS = 8  # of a hash in a name
 MOST = 6  # figures of a table whose figures nobody chose
 
 MAIN = ("acc", "avg", "omae")  # metrics of a table of arms whose figures nobody chose
 
-WIDE = 20.0
-"""Largest over smallest value from which on an axis is logarithmic."""
+WIDE = 20.0  # largest over smallest value from which on an axis is logarithmic
 
 NOTE = (
     "Scores are those of test objects.  They say how much a setting matters; a setting that was chosen by them must be "
@@ -138,8 +136,7 @@ def main(arguments: Sequence[str], package: str = "experiments") -> int:
 def options_of(vary: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """Option → its values, from words such as `grpo.lr_scale=50,100`; dashes and underscores are the same.
 
-    Raises:
-      SweepError: a word without an option and values, or an option named twice.
+    `SweepError` for a word without an option and values, or an option named twice.
     """
     found: dict[str, tuple[str, ...]] = {}
     for word in vary:
@@ -161,10 +158,8 @@ def plan(
     """The folder of a sweep and its units, in the order of the values, the last option fastest.
 
     Args:
-      experiment, about: what runs, and its docstring.
       vary: options and their values, as `options_of` takes them.
       rest: words of the command line for all runs.
-      runs_dir: folder of all runs.
       into: the folder; by default named after the units, so that the same sweep goes on in it.
 
     Raises:
@@ -341,13 +336,9 @@ def chosen_figures(results: Sequence[Mapping[str, Any]], wanted: Sequence[str]) 
 
 
 def chart(finished: Sequence[tuple[Mapping[str, str], Mapping[str, Any]]], chosen: Sequence[str]) -> bytes:
-    """Draw a panel for each metric, or each figure without one, over the first option.
+    """Draw a panel for each metric, or each chosen figure without one, over the first option.
 
     A line is an arm, and an arm for each setting of the further options.
-
-    Args:
-      finished: settings and figures of each run.
-      chosen: names of the figures.
     """
     first = next(iter(finished[0][0]))
     listed = list(dict.fromkeys(settings[first] for settings, _ in finished))

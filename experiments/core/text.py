@@ -3,8 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
-ABSENT = "–"
-"""Stands for a number that was not measured."""
+ABSENT = "–"  # stands for a number that was not measured
 
 SMOKE, MEANINGLESS = "smoke", "smoke: the figures mean nothing"
 """The scale that only shows that an experiment runs, and what stands in place of its verdict."""

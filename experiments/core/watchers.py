@@ -20,14 +20,12 @@ from experiments.core.report import render
 from experiments.core.runs import continuing, point_latest
 from experiments.core.text import duration
 
-PAGE_EVERY_S = 10
-"""Least seconds between two pages, and between two reloads by a browser."""
+PAGE_EVERY_S = 10  # least seconds between two pages, and between two reloads by a browser
 
 CURVES_SHARE = 0.01
 """Share of the run's time for curves: after some that took a second to draw, the next follow after 100 s."""
 
-MOST_PANELS = 9
-"""Panels of a phase whose scalars the experiment does not choose."""
+MOST_PANELS = 9  # panels of a phase whose scalars the experiment does not choose
 
 TENSORBOARD = "tensorboardX"
 
@@ -36,14 +34,9 @@ WANDB = "wandb"
 PACKAGES = {"tensorboard": TENSORBOARD, "wandb": WANDB}
 """Flag, which is also the name of the extra that installs it, and the package that it needs."""
 
-PROJECT = "touchr1-jax"
-"""Project of Weights & Biases, unless WANDB_PROJECT names another."""
-
-SAMPLES = 6
-"""Answers on the page of a run."""
-
-FLUSH_S = 10
-"""Seconds until an event is on the disk."""
+PROJECT = "touchr1-jax"  # project of Weights & Biases, unless WANDB_PROJECT names another
+SAMPLES = 6  # answers on the page of a run
+FLUSH_S = 10  # seconds until an event is on the disk
 
 
 class Latest(Watcher):
@@ -196,9 +189,6 @@ class Events(Watcher):
 
     A continued stage gets one more file, whose first event makes TensorBoard drop the events of the last session at or
     past its step.  Events have a time, lines of `metrics.jsonl` do not.
-
-    Raises:
-      ModuleNotFoundError: tensorboardX is not installed.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -230,12 +220,6 @@ class WeightsAndBiases(Watcher):
     """Sends every number of every logged line to Weights & Biases, with a step of its own for every stage.
 
     A continued run goes on in the same place.  Its environment variables count, such as WANDB_MODE and WANDB_PROJECT.
-
-    Args:
-      directory, description: of the run.
-
-    Raises:
-      ModuleNotFoundError: wandb is not installed.
     """
 
     def __init__(self, directory: Path, description: Mapping[str, Any]) -> None:

@@ -36,14 +36,7 @@ class Damage:
 
 
 def damage_each(unfinished: Path, scratch: Path, context: Context, most: int | None = None) -> Iterator[Damage]:
-    """Damage a file in a copy of an unfinished run, continue it, and compare its end with an undamaged copy's.
-
-    Args:
-      unfinished: the folder of the run.
-      scratch: an empty folder.
-      context: for progress.
-      most: number of files that are damaged in every way; `None` for all.
-    """
+    """Damage each of at most so many files in a copy of an unfinished run, continue it, compare its end."""
     whole = scratch / "whole"
     shutil.copytree(unfinished, whole, symlinks=True)
     _continued(whole)
@@ -78,13 +71,7 @@ def telling_line(output: str, scratch: Path) -> str:
 
 
 def end_of_run(runs: Path, code: int, output: str, wanted: Mapping[str, str]) -> str:
-    """The outcome of a run with damage.
-
-    Args:
-      runs: the folder of the run's experiment.
-      code, output: of the session that continued it.
-      wanted: digests of an undamaged run.
-    """
+    """The outcome of a run with damage by the session that continued it; `wanted` are digests of an undamaged run."""
     if code:
         return NAMED if "Error: " in output and "Traceback" not in output else WRONG
     ends = [path.parent for path in runs.glob("*/results.json") if not path.parent.is_symlink()]

@@ -51,15 +51,7 @@ class Flip:
 
 
 def flip_bits(root: Path, scratch: Path, context: Context, count: int, seed: int = 0) -> Iterator[Flip]:
-    """Flip one bit at a time in a copy of a folder: a random bit of a random file of a random kind.
-
-    Args:
-      root: a run, its cache and its compiled programs.
-      scratch: an empty folder for the copy.
-      context: for progress.
-      count: number of flips.
-      seed: of the choice.
-    """
+    """Flip one bit at a time in a copy of a folder: a random bit of a random file of a random kind."""
     copy = shutil.copytree(root, scratch / "flipped", symlinks=True)
     kinds: dict[str, list[Path]] = {}
     whole: dict[Path, str] = {}
@@ -86,16 +78,9 @@ def go_on_flipped(
     context: Context,
     most: int,
 ) -> Iterator[Damage]:
-    """Ends of copies of a run that go on with flipped bits.
+    """Ends of copies of a run that go on with flipped bits: all that change nothing at once, and some found ones alone.
 
-    Args:
-      unfinished: its home; where it is finished, the copies lack its results.
-      flips: those of `flip_bits`.
-      wanted: digests of an undisturbed run.
-      training, programs: of its sessions.
-      scratch: an empty folder.
-      context: for progress.
-      most: number of the flips that were found, of as many kinds of file as there are.
+    `wanted` are digests of an undisturbed run; `most` found flips are tried, of as many kinds of file as there are.
     """
     together = [one for one in flips if one.reading in (SAME, UNREAD)]
     found = [one for one in flips if one.reading == FOUND]

@@ -86,15 +86,8 @@ def replay_camera(
 ) -> ReplayOutcome:
     """Replay a camera through the package's reader.
 
-    Args:
-      source: of the pictures.
-      seconds: of device time.
-      faults: to inject.
-      capacity: of the reader's ring.
-      every: samples between two visits of the consumer, which reads half of the ring each time; with many, a small
-        ring overflows.
-      traced: whether Python's memory is traced, which takes twice the time.
-      report: receives the seconds of device time at every tenth.
+    The consumer visits every so many samples and reads half of the ring each time; with many, a small ring overflows.
+    Tracing Python's memory takes twice the time.
     """
     clock = JumpingClock()
     replay = Replay(source, seconds=seconds, faults=faults, clock=clock)

@@ -49,8 +49,9 @@ from experiments.faults.kills import (
 )
 from experiments.faults.trainings.small_grpo import EXPERIMENT as SMALL_GRPO
 from experiments.faults.trainings.small_study import EXPERIMENT as SMALL_STUDY
-from experiments.study import stages
 from experiments.study.scores import PUBLISHED
+from experiments.study.seed import StudySeed
+from experiments.study.stages import gather_evidence, make_arm, probe_features
 from experiments.study.study import StudyConfig, open_study_data
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.models.touch_policy import build_policy, with_lora
@@ -230,23 +231,20 @@ def try_inputs(most: int | None, context: Context, scratch: Path) -> list[InputR
 def waits(config: WaitingConfig, context: Context) -> Waits:
     """Train each stage for some steps from where it is; a stage that is done is not timed again."""
     study, loop = config.study, LoopConfig(steps=config.steps, save_every=config.steps)
-    sft, grpo, blind, dynamics = names = ("sft/0", "grpo/published/0", "blind/0", "dynamics/0")
     data = open_study_data(study, context)
     policy = with_lora(build_policy(study.model, data.clip.sensors), study.lora)
-    evidence = stages.gather_evidence(data, stages.probe_features(data, context), study.probe, context)
-    sft_config = dataclasses.replace(study.sft, steps=config.steps, save_every=config.steps)
-    params = stages.run_sft(policy, data, evidence, sft_config, context, seed=0, stage=sft)
-    rows, noise = data.parts["grpo"], stages.noise_bank(policy, params, data, seed=0)
-    features, label = stages.encode_rows(policy, params, data, rows, context), data.label[rows]
-    contacts = stages.EncodedContacts(features=features, label=label, truth=label, noise=noise, evidence=evidence[rows])
-    arm = stages.make_arm(policy, PUBLISHED, data.prior(), study.grpo, loop)
-    stages.run_grpo(policy, arm, contacts, params, context, seed=0, stage=grpo)
-    blind_config = dataclasses.replace(study.blind, steps=BLIND * config.steps, save_every=BLIND * config.steps)
-    stages.run_sft(policy, data, evidence, blind_config, context, seed=0, stage=blind, blind=True)
+    evidence = gather_evidence(data, probe_features(data, context), study.probe, context)
+    seed = StudySeed(config=study, data=data, policy=policy, evidence=evidence, context=context, seed=0)
+    some = lambda sft, steps: dataclasses.replace(sft, steps=steps, save_every=steps)
+    params = seed.run_sft(some(study.sft, config.steps), "sft")
+    arm = make_arm(policy, PUBLISHED, data.prior(), study.grpo, loop)
+    seed.run_grpo(arm, "grpo/published", seed.contacts(params), params)
+    seed.run_sft(some(study.blind, BLIND * config.steps), "blind", blind=True)
     pretraining = dataclasses.replace(config.dynamics, steps=config.steps, probe_every=config.steps)
-    pretrain(pretraining, data.store, data.parts["sft"], data.clip, context, stage=dynamics, seed=0)
+    pretrain(pretraining, data.store, data.parts["sft"], data.clip, context, stage="dynamics/0", seed=0)
     times = context.timing()
-    return {stage: (times[f"{STEPPING}/{stage}"], times[f"{WAITING}/{stage}"]) for stage in names}
+    stages = ("sft/0", "grpo/published/0", "blind/0", "dynamics/0")
+    return {stage: (times[f"{STEPPING}/{stage}"], times[f"{WAITING}/{stage}"]) for stage in stages}
 
 
 def requirements(

@@ -53,11 +53,7 @@ class RecordingCheck:
 
 
 def recordings(data_dir: pathlib.Path | None) -> list[pathlib.Path]:
-    """The vendor's recordings below a directory.
-
-    Raises:
-      FileNotFoundError: a directory without any.
-    """
+    """The vendor's recordings below a directory, which must hold some."""
     if data_dir is None:
         return []
     found = sorted((data_dir / "tac3d").glob("*.npz"))

@@ -37,7 +37,7 @@ from experiments.study import paper_numbers as paper
 from experiments.study.ablation import Ablation
 from experiments.study.controls import control_sentences
 from experiments.study.seed import TrainedPolicy
-from experiments.study.stages import encode_rows, untrained
+from experiments.study.stages import untrained
 from experiments.study.study import SFT, EvalVariant, StudyConfig
 from touchr1_jax.training.evaluation import Evaluation
 
@@ -57,8 +57,7 @@ WEIGHTS, ALGORITHMS = reinforced(c.added for c in COMPONENTS)
 def without_training(trained: TrainedPolicy) -> Evaluation:
     """The policy as it is before SFT."""
     params = untrained(trained.policy, trained.data, trained.seed)
-    rows = trained.data.parts["test"]
-    return trained.ask(params, encode_rows(trained.policy, params, trained.data, rows, trained.context))
+    return trained.ask(params, trained.encode(params, "test"))
 
 
 ABLATION = Ablation(

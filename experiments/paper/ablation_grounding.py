@@ -17,8 +17,7 @@ from experiments.study.ablation import Ablation, ablation_experiment
 from experiments.study.scores import PUBLISHED
 from touchr1_jax.rl.config import Paper
 
-STRONG = 0.04
-"""The γ at which PAPO collapses without a cap."""
+STRONG = 0.04  # the γ at which PAPO collapses without a cap
 
 ABLATION = Ablation(
     arms=dict.fromkeys(("none", "paper", "strong", "strong_bounded"), PUBLISHED),

@@ -36,7 +36,7 @@ from experiments.study.controls import control_sentences
 from experiments.study.paper_numbers import differences_table
 from experiments.study.scores import PUBLISHED
 from experiments.study.seed import TrainedPolicy
-from experiments.study.stages import encode_rows, run_grpo, untrained
+from experiments.study.stages import untrained
 from experiments.study.study import SFT, EvalVariant, StudyConfig, make_study_arm
 from touchr1_jax.training.evaluation import Evaluation
 
@@ -54,13 +54,11 @@ WEIGHTS, ALGORITHMS = reinforced([omitted(FULL), *FROM_SFT])
 
 def without_sft(trained: TrainedPolicy) -> Evaluation:
     """GRPO from fresh parameters, with the questions and steps of the arms that start from SFT."""
-    policy, data, seed = trained.policy, trained.data, trained.seed
-    params = untrained(policy, data, seed)
+    params = untrained(trained.policy, trained.data, trained.seed)
     config = dataclasses.replace(trained.config, recipe="paper")  # without the anchor, which is SFT
-    arm = make_study_arm(config, policy, PUBLISHED, data.prior(), WITH_TACTILE_USE)
-    contacts = trained.contacts(params)
-    tuned = run_grpo(policy, arm, contacts, params, trained.context, seed=seed, stage=f"grpo/{NO_SFT}/{seed}")
-    return trained.ask(tuned, encode_rows(policy, params, data, data.parts["test"], trained.context))
+    arm = make_study_arm(config, trained.policy, PUBLISHED, trained.data.prior(), WITH_TACTILE_USE)
+    tuned = trained.run_grpo(arm, f"grpo/{NO_SFT}", trained.contacts(params), params)
+    return trained.ask(tuned, trained.encode(params, "test"))
 
 
 ABLATION = Ablation(

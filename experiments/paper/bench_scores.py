@@ -16,6 +16,7 @@ from experiments.bench.contacts import measure_split
 from experiments.core.context import Context
 from experiments.core.results import Cell, Estimate, Table, named_table
 from experiments.core.text import ABSENT, bounds, number
+from experiments.study.answers import concluded
 from experiments.study.dataset import Dataset
 from experiments.study.estimates import RESAMPLES, estimate
 from experiments.study.paper_numbers import Row as PaperRow
@@ -29,13 +30,11 @@ from touchr1_jax.bench.scoring import REPORTED, ItemAnswers, score
 from touchr1_jax.bench.statistics import draw_clusters, drawn_means, improvement_interval, stratified_bootstrap_iqm
 from touchr1_jax.training.evaluation import Evaluation
 
-ORDINAL_LEVELS = 3
-"""K of ordinal levels: means of levels over K stay below one level."""
+ORDINAL_LEVELS = 3  # K of ordinal levels: means of levels over K stay below one level
 
 AVERAGE_MEANING = "mean of the nine columns, OMAE as 100(1 − OMAE/2), ρ as 100ρ"
 
-Estimates = Mapping[str, Estimate]
-"""Metric → estimate, of one row of a table."""
+Estimates = Mapping[str, Estimate]  # metric → estimate, of one row of a table
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -52,9 +51,9 @@ class SingleTouchAnswers:
         level = np.full((contacts, attributes), BOTTOM)
         alone = np.full((contacts, streams, attributes), BOTTOM)
         n = np.arange(len(answers.contact))
-        concluded = np.asarray(answers.parsed.conclude)[n, answers.attribute]
-        level[answers.contact, answers.attribute] = concluded
-        repeated = np.repeat(concluded[:, None], streams, 1)
+        together = concluded(answers)
+        level[answers.contact, answers.attribute] = together
+        repeated = np.repeat(together[:, None], streams, 1)
         single = repeated if answers.alone is None else answers.alone[n, :, answers.attribute]
         alone[answers.contact, :, answers.attribute] = single
         return SingleTouchAnswers(level=level, alone=alone)
@@ -115,10 +114,6 @@ def bench_row(
     """Every metric of the bench that the questions define, and their average where all of its metrics are there.
 
     A metric about a single object has no interval and is left out, and so is one that some seed lacks.
-
-    Args:
-      asks: the questions.
-      answers, by_picture: those of every seed, and those from pictures alone.
     """
     priors: Sequence[ItemAnswers | None] = [None] * len(answers) if by_picture is None else by_picture
     tables = [score(asks, given, prior) for given, prior in zip(answers, priors, strict=True)]
@@ -146,13 +141,7 @@ def average(tables: Sequence[Mapping[str, Scores]], objects: np.ndarray) -> Esti
 def comparison_table(
     title: str, ours: Mapping[str, Estimates], theirs: Mapping[str, tuple[PaperRow, float] | None], note: str
 ) -> Table:
-    """Our rows, then the paper's, in the columns of its main table; the last columns are averages.
-
-    Args:
-      title, note: heading, and a sentence above the table.
-      ours: row → metric.
-      theirs: row → the paper's figures and its printed average; `None` where it prints none.
-    """
+    """Our rows, then the paper's with their printed averages, in the columns of its main table."""
     titles = {m: REPORTED[m].title for m in AVERAGED}
     rows: list[dict[str, Cell]] = []
     for name, row in ours.items():

@@ -21,8 +21,7 @@ ATTRIBUTES = ("hardness", "roughness", "protrusion", "material")
 
 ClaimVerdict = Literal["holds", "does not hold", "cannot be told", "contradicts itself"]
 
-FOUR = ("h_acc", "r_acc", "p_acc", "mat_acc")
-"""Whose mean the paper's ladder prints as Avg."""
+FOUR = ("h_acc", "r_acc", "p_acc", "mat_acc")  # whose mean the paper's ladder prints as Avg
 
 _INTERVAL = re.compile(r"\[([^,\]]+), ([^\]]+)\]")
 

@@ -1,7 +1,7 @@
 """The change that each component makes: differences of arms with intervals and corrected p-values, and the paper's."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -11,34 +11,110 @@ from experiments.core.context import Context, read_metrics
 from experiments.core.look import PALETTE, SHARED
 from experiments.core.results import Estimate, Picture, Results, Table, named_table
 from experiments.core.text import bounds, interval, number
-from experiments.paper.failure_modes import ArmMeasurements, diagnose, training_history
 from experiments.study.ablation import Ablation, run_ablation
-from experiments.study.baselines import baselines
-from experiments.study.estimates import RESAMPLES, estimate
-from experiments.study.scores import Scored, score
+from experiments.study.alarm_log import ALARM
+from experiments.study.estimates import RESAMPLES, SeedScores, estimate
+from experiments.study.scores import Scored, baselines, score
 from experiments.study.study import Study, StudyConfig
 from touchr1_jax.bench.metrics import Scores, mean_accuracy
-from touchr1_jax.bench.statistics import (
-    Interval,
-    clustered_bootstrap,
-    crossed_test,
-    holm,
-    student_interval,
-)
+from touchr1_jax.bench.statistics import Interval, clustered_bootstrap, crossed_test, holm, student_interval
+from touchr1_jax.rl.alarms import RULES, START, WINDOW
 
 FOUR = "four_acc"
 """Mean accuracy over hardness, roughness, protrusion and material: what the paper's ladder prints as Avg."""
 
+MOST = 0.5
+"""Share of seeds in which an alarm fires, of groups that teach nothing, or of entropy that is left: a failure shows."""
+
+POINTS = 2.0  # change of a share, in points, that counts: about the spread between seeds
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrainingHistory:
+    """Metrics of an arm's training, means over seeds of the first and of the last steps, and its alarms.
+
+    `alarms` maps a code to the share of seeds in which it fired.
+    """
+
+    start: Mapping[str, float]
+    end: Mapping[str, float]
+    alarms: Mapping[str, float]
+
+
+def training_history(lines: Iterable[Mapping[str, Any]], arm: str) -> TrainingHistory | None:
+    """The training of an arm from the lines of `metrics.jsonl`; `None` where GRPO did not train it."""
+    stages: dict[str, list[Mapping[str, Any]]] = {}
+    for line in lines:
+        if line["stage"].startswith(f"grpo/{arm}/"):
+            stages.setdefault(line["stage"], []).append(line)
+    if not stages:
+        return None
+    seeds = [sorted(rows, key=lambda line: line["step"]) for rows in stages.values()]
+    fired = [{name.removeprefix(ALARM) for line in rows for name in line if name.startswith(ALARM)} for rows in seeds]
+    return TrainingHistory(
+        start=_means([rows[:START] for rows in seeds]),
+        end=_means([rows[-WINDOW:] for rows in seeds]),
+        alarms={code: sum(code in one for one in fired) / len(fired) for code in sorted(set().union(*fired))},
+    )
+
+
+def _means(seeds: Sequence[Sequence[Mapping[str, Any]]]) -> dict[str, float]:
+    names = set.intersection(*({n for line in rows for n in line if not n.startswith(ALARM)} for rows in seeds))
+    return {
+        name: float(np.mean([np.mean([line[name] for line in rows if name in line]) for rows in seeds]))
+        for name in sorted(names - {"stage", "step"})
+    }
+
+
+def diagnose(
+    history: TrainingHistory | None,
+    before: Mapping[str, float],
+    after: Mapping[str, float],
+    *,
+    consistency: bool = False,
+) -> Iterator[str]:
+    """The known failures that an arm shows against another, each with its code and the figures.
+
+    F1 the middle level is overpaid for being near everything; F2 slots echo each other for the consistency reward,
+    which also drives the middle level out, since sensors disagree most about middle objects; F7 groups of equal rewards
+    teach nothing; F9 entropy collapses; F13 answers are paid that cannot be read; all others by the alarms.
+
+    Args:
+      history: the arm's training, if GRPO trained it.
+      before, after: means of the other and of the arm on the test questions.
+      consistency: whether the arm is rewarded for consistency.
+    """
+    history, both = history or TrainingHistory(start={}, end={}, alarms={}), before.keys() & after.keys()
+    meanings = {rule.code: rule.meaning for rule in sorted(RULES, key=lambda rule: not rule.at_once)}
+    for code, share in history.alarms.items():
+        if share >= MOST:
+            yield f"{code}: {meanings[code]} (alarm in {100 * share:.0f} % of the seeds)"
+    if "middle_rate" in both:
+        middle = f"{before['middle_rate']:.0f} → {after['middle_rate']:.0f} %"
+        if after["middle_rate"] - before["middle_rate"] > POINTS:
+            yield f"F1: middle answers {middle}"
+        if before["middle_rate"] - after["middle_rate"] > POINTS:
+            code, why = ("F2", "the consistency reward") if consistency else ("F9", "sharpening")
+            yield f"{code}: {why} drives the middle level out, {middle} of answers"
+    if {"csc_slot", "csc"} <= both:
+        slots, right = (after[m] - before[m] for m in ("csc_slot", "csc"))
+        if slots > POINTS and right < slots - POINTS:
+            yield f"F2: agreement of slots {slots:+.0f} points, right conclusions by single sensors {right:+.0f}"
+    if (degenerate := history.end.get("drawn_degenerate_share", history.end.get("degenerate_share", 0.0))) > MOST:
+        yield f"F7: {100 * degenerate:.0f} % of the groups earn one reward and teach nothing"
+    first, last = (steps.get("entropy", 0.0) for steps in (history.start, history.end))
+    if "entropy" in history.end and first > 0 and last < MOST * first:
+        yield f"F9: entropy {first:.3f} → {last:.3f} nat a token"
+    if "parse_rate" in both and before["parse_rate"] - after["parse_rate"] > POINTS:
+        yield f"F13: answers that can be read {before['parse_rate']:.0f} → {after['parse_rate']:.0f} %"
+
+
 PRIMARY = {("SFT", FOUR), ("ordinal credit", "omae"), ("consistency", "csc")}
 """Component and metric of the three claims that the paper rests on; all other effects are exploratory."""
 
-LEVEL = 0.05
-"""p-value below which a sign counts."""
+LEVEL = 0.05  # p-value below which a sign counts
 
 SignVerdict = Literal["reproduced", "opposite", "undecided", "not in the paper"]
-
-SeedScores = Sequence[Mapping[str, Scores]]
-"""Metric → scores, of every seed."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -60,14 +136,10 @@ LADDER_METRICS: tuple[LadderMetric, ...] = (
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ComponentStep:
-    """One arm against another.
+    """`arm`, which has a component, against another, and the paper's change in the columns of `LADDER_METRICS`.
 
-    Attributes:
-      arm, against: `arm` has the component, `against` does not.
-      component: its name.
-      published: the paper's change in the columns of `LADDER_METRICS`; `None` where it has no such row.
-      omission: search the run of `against` for failures whatever comes out; else that of `arm`, and only where the
-        paper's sign does not come out.
+    With `omission` the run of `against` is searched for failures whatever comes out; else that of `arm`, and only where
+    the paper's sign does not come out.
     """
 
     arm: str
@@ -121,15 +193,9 @@ class ComponentEffect:
 def component_effects(
     steps: Sequence[ComponentStep], rows: Mapping[str, SeedScores], objects: np.ndarray
 ) -> tuple[ComponentEffect, ...]:
-    """Every step in every metric of the ladder that both of its arms have.
+    """Every step in every metric of the ladder that both of its arms have, two seeds at least.
 
-    Args:
-      steps: comparisons.
-      rows: arm → seeds; an arm of one seed, a baseline, is compared with every seed of the other.
-      objects: [N], the object of each question.
-
-    Raises:
-      ValueError: two arms of different numbers of seeds, or fewer than two seeds.
+    An arm of one seed, a baseline, is compared with every seed of the other; `objects` [N] is that of each question.
     """
     found = [
         _effect(step, metric, *_paired(step, metric.metric, rows), objects)
@@ -169,12 +235,9 @@ def _effect(
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ComponentComparison:
-    """The rows of a ladder and what its steps change.
+    """The rows of a ladder, `FOUR` among their metrics, and what its steps change; a single seed has no effects.
 
-    Attributes:
-      estimates: row → metric of all policies, variants and baselines, `FOUR` among them.
-      effects: differences of the steps; none with a single seed.
-      failures: known failures that show in the runs behind an effect.
+    `failures` are those that show in the runs behind an effect.
     """
 
     estimates: Mapping[str, Mapping[str, Estimate]]
@@ -231,10 +294,7 @@ def compare_components(
             continue
         arm, other = (step.against, step.arm) if step.omission else (step.arm, step.against)
         consistency = "consistency" in study.arms.get(arm, {})
-        history = training_history(lines, arm)
-        shown = diagnose(
-            ArmMeasurements(history=history, after=means[arm], before=means[other], consistency=consistency)
-        )
+        shown = tuple(diagnose(training_history(lines, arm), means[other], means[arm], consistency=consistency))
         failures[effect] = shown or (() if effect.sign == "reproduced" else (_no_failure(effect),))
     return ComponentComparison(estimates=found, effects=effects, failures=failures)
 

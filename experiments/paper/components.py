@@ -17,8 +17,7 @@ BASE, FULL, NO_SFT = "constant", "full", "no_sft"
 """The base is the commonest level of each attribute: the paper's, a pretrained model asked without training, answers
 near chance too, while nothing can be read in the answers of a policy that is untrained here."""
 
-BASE_ROW = "Qwen2.5-VL-7B"
-"""Of the paper's ladder."""
+BASE_ROW = "Qwen2.5-VL-7B"  # of the paper's ladder
 
 
 def published_without(*terms: str) -> Weights:
@@ -29,8 +28,7 @@ def published_without(*terms: str) -> Weights:
 ZERO_ONE: Weights = {"exact": PUBLISHED["accuracy"], **published_without("accuracy")}
 """The published reward with 0/1 credit in place of ordinal credit."""
 
-UNGROUNDED = Paper(gamma=0.0)
-"""GRPO without the grounding term."""
+UNGROUNDED = Paper(gamma=0.0)  # GRPO without the grounding term
 
 WITH_TACTILE_USE = Paper(tactile_use=TactileUse.RECOMMENDED)
 """The published objective with credit for the use of touch, which the paper's abstract names and no equation holds."""
@@ -47,14 +45,7 @@ class ComponentArm:
 
 @dataclasses.dataclass(frozen=True)
 class Component:
-    """One component of the objective.
-
-    Attributes:
-      name: what is added or left out.
-      row: of the paper's ladder, the first that has the component; `None` where no row has it.
-      added: the ladder up to this component.
-      omitted: the full objective without it.
-    """
+    """One component: the paper's first row that has it, the ladder up to it, and the full objective without it."""
 
     name: str
     row: str | None

@@ -34,13 +34,13 @@ from experiments.paper.components import FULL, run_full_model
 from experiments.paper.touch_gain import (
     TouchGain,
     TouchQuestions,
-    concluded,
     control_answers,
     control_variants,
     study_touch_gain,
     touch_gain_table,
     touch_questions,
 )
+from experiments.study.answers import concluded
 from experiments.study.controls import against_control, control_sentences, decision_table
 from experiments.study.estimates import RESAMPLES
 from experiments.study.examples import rollout_examples
@@ -128,11 +128,7 @@ def run(config: StudyConfig, context: Context) -> Results:
 
 
 def picture_prior(blind: Sequence[np.ndarray]) -> list[Int[np.ndarray, "N"]]:
-    """For every seed the majority answer of the other seeds' policies without touch, the lower level on a tie.
-
-    Raises:
-      ValueError: fewer than two seeds.
-    """
+    """For every seed the majority answer of the other seeds' policies without touch, the lower level on a tie."""
     if len(blind) < 2:
         raise ValueError(f"blind holds {len(blind)} seeds: the prior from pictures needs two; train more")
     levels = max(1, *(int(answers.max()) + 1 for answers in blind))
@@ -177,11 +173,7 @@ def contrasts_of(
 def contrast(
     questions: TouchQuestions, ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray], masks: Sequence[np.ndarray]
 ) -> AccuracyContrast:
-    """Compare two policies' levels [N], paired by question and seed, on the questions of each seed's mask [N].
-
-    Raises:
-      ValueError: a mask without a question, or fewer than two seeds or objects.
-    """
+    """Compare two policies' levels [N], paired by question and seed, on the questions of each seed's mask [N]."""
     for seed, mask in enumerate(masks):
         if not mask.any():
             raise ValueError(f"masks[{seed}] holds no question: a contrast needs one; ask about more objects")

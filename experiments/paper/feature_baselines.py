@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from experiments.core.errors import DataError
-from experiments.study.baselines import level_answers
+from experiments.study.scores import level_answers
 from experiments.study.seed import TrainedPolicy
 from experiments.study.stages import encode_rows
 from sensors_io.records import RecordStore
@@ -29,11 +29,8 @@ NEIGHBOURS = 15
 CELLS = 8
 """Cells along a side that fields and pictures are averaged to: about 2 mm each on the widest sensor."""
 
-FINE_PX, COARSE_PX = 1, 4
-"""Distances between the pixels whose difference measures texture."""
-
-TINY = 1e-3
-"""Keeps the logarithm of a flat picture finite; pictures are in 0..1."""
+FINE_PX, COARSE_PX = 1, 4  # distances between the pixels whose difference measures texture
+TINY = 1e-3  # keeps the logarithm of a flat picture finite; pictures are in 0..1
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -52,28 +49,12 @@ class ContactFeatures:
         return ContactFeatures(x=self.x[:, [stream]], present=self.present[:, [stream]])
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class LabelledFeatures:
-    """Training contacts: their features, and their labels, −1 where nobody annotated."""
-
-    features: ContactFeatures
-    label: Int[np.ndarray, "n A"]
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PredictedLevels:
-    """Levels of m contacts from all streams together, [m, A], and from each stream alone, [m, S, A]."""
-
-    together: Int[np.ndarray, "m A"]
-    alone: Int[np.ndarray, "m S A"]
+Predict = Callable[[ContactFeatures, Int[np.ndarray, "n A"], ContactFeatures], Int[np.ndarray, "m A"]]
+"""Features of training contacts, their labels, −1 where nobody annotated, and features of others → their levels."""
 
 
 def other_objects(objects: np.ndarray, seed: int) -> Int[np.ndarray, "n"]:
-    """For every contact the position of a random contact of another object; `objects` [n] is that of each contact.
-
-    Raises:
-      DataError: there is only one object.
-    """
+    """For every contact the position of a random contact of another object; `objects` [n] is that of each contact."""
     names, index = np.unique(objects, return_inverse=True)
     if len(names) < 2:
         raise DataError(f"objects holds only {names.tolist()}: another object's touch needs two; use more contacts")
@@ -130,57 +111,52 @@ def _cells(image: np.ndarray) -> Float[np.ndarray, "D"]:
 
 
 def together_and_alone(
-    predict: Callable[[LabelledFeatures, ContactFeatures], np.ndarray], known: LabelledFeatures, asked: ContactFeatures
-) -> PredictedLevels:
-    """Predictions from all streams and from each alone, by `nearest` or `linear_probe`; ⊥ where none was recorded."""
+    predict: Predict, known: ContactFeatures, label: Int[np.ndarray, "n A"], asked: ContactFeatures
+) -> tuple[Int[np.ndarray, "m A"], Int[np.ndarray, "m S A"]]:
+    """Levels by `nearest` or `linear_probe` from all streams and from each alone; ⊥ where none was recorded."""
 
-    def levels(k: LabelledFeatures, a: ContactFeatures) -> np.ndarray:
-        return np.where(np.any(a.present, axis=1, keepdims=True), predict(k, a), BOTTOM)
+    def levels(k: ContactFeatures, a: ContactFeatures) -> np.ndarray:
+        return np.where(np.any(a.present, axis=1, keepdims=True), predict(k, label, a), BOTTOM)
 
-    streams = range(asked.x.shape[1])
-    single = [levels(dataclasses.replace(known, features=known.features.only(s)), asked.only(s)) for s in streams]
-    together = single[0] if len(single) == 1 else levels(known, asked)
-    return PredictedLevels(together=together, alone=np.stack(single, 1))
+    single = [levels(known.only(s), asked.only(s)) for s in range(asked.x.shape[1])]
+    return single[0] if len(single) == 1 else levels(known, asked), np.stack(single, 1)
 
 
 def nearest(
-    known: LabelledFeatures, asked: ContactFeatures, *, levels: tuple[int, ...], neighbours: int = NEIGHBOURS
+    known: ContactFeatures,
+    label: np.ndarray,
+    asked: ContactFeatures,
+    *,
+    levels: tuple[int, ...],
+    neighbours: int = NEIGHBOURS,
 ) -> Int[np.ndarray, "m A"]:
     """The vote of the k nearest training contacts, each weighing 1/d; features without spread do not count.
 
         d² = mean over streams that both have of mean_D ((x − x′)/σ)²
 
-    Args:
-      known, asked: training contacts, and those to answer for.
-      levels: K of each attribute.
-      neighbours: k; fewer where fewer are annotated.
-
-    Raises:
-      ValueError: an attribute that no training contact is annotated for.
+    `levels` are K of each attribute; there are fewer neighbours where fewer contacts are annotated.
     """
-    distance = _distances(known.features, asked)
+    distance = _distances(known, asked)
     out = np.zeros((len(asked.x), len(levels)), int)
     for a, count in enumerate(levels):
-        rows = _annotated(known.label[:, a], a)
+        rows = _annotated(label[:, a], a)
         near = np.argsort(distance[:, rows], axis=1, kind="stable")[:, :neighbours]
         weight = 1 / np.maximum(np.take_along_axis(distance[:, rows], near, 1), np.finfo(np.float32).tiny)
-        votes = known.label[rows, a][near]
+        votes = label[rows, a][near]
         out[:, a] = np.stack([(weight * (votes == k)).sum(1) for k in range(count)], 1).argmax(1)
     return out
 
 
 def linear_probe(
-    known: LabelledFeatures, asked: ContactFeatures, *, levels: tuple[int, ...], config: ProbeConfig
+    known: ContactFeatures, label: np.ndarray, asked: ContactFeatures, *, levels: tuple[int, ...], config: ProbeConfig
 ) -> Int[np.ndarray, "m A"]:
-    """The likeliest level by a multinomial probe on the concatenated streams; arguments and error as of `nearest`."""
-    n = len(known.label)
-    x = np.concatenate([features.x.reshape(len(features.x), -1) for features in (known.features, asked)])
+    """The likeliest level by a multinomial probe on the concatenated streams; arguments as of `nearest`."""
+    x = np.concatenate([features.x.reshape(len(features.x), -1) for features in (known, asked)])
+    every = np.concatenate([label, np.full((len(asked.x), label.shape[1]), -1)])
     columns = []
     for a, count in enumerate(levels):
-        rows = _annotated(known.label[:, a], a)
-        weight = np.isin(np.arange(len(x)), rows)[None]
-        label = np.concatenate([known.label[:, a], np.full(len(asked.x), -1)])
-        columns.append(probe_log_probs(x, label, weight, count, config)[0, n:].argmax(-1))
+        weight = np.isin(np.arange(len(x)), _annotated(label[:, a], a))[None]
+        columns.append(probe_log_probs(x, every[:, a], weight, count, config)[0, len(label) :].argmax(-1))
     return np.stack(columns, 1)
 
 
@@ -194,8 +170,7 @@ def encoder_probe(trained: TrainedPolicy, *, swapped: bool = False) -> Evaluatio
         known = known.rows(other_objects(data.object_ids[rows], trained.seed))
         asked = asked.rows(other_objects(data.object_ids[data.parts["test"]], trained.seed))
     probe = functools.partial(linear_probe, levels=trained.policy.levels, config=trained.config.probe)
-    levels = together_and_alone(probe, LabelledFeatures(features=known, label=data.label[rows]), asked)
-    return level_answers(trained.policy, trained.evaluation, levels.together, levels.alone)
+    return level_answers(trained.policy, trained.evaluation, *together_and_alone(probe, known, data.label[rows], asked))
 
 
 def mean_tokens(features: Features) -> ContactFeatures:

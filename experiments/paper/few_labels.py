@@ -19,31 +19,22 @@ import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
 
 from experiments.core.artifacts import write_bytes
+from experiments.core.charts import Panel, draw, estimates
 from experiments.core.context import Context
-from experiments.core.results import Cell, Picture, Results, Table, named_table
+from experiments.core.results import Cell, Comparison, Estimate, Picture, Results, Table, named_table
 from experiments.core.runner import Experiment
+from experiments.core.text import bounds, interval
 from experiments.encoder.pretrain import pretrain
-from experiments.paper.label_curves import (
-    METHODS,
-    PRETRAINED,
-    RANDOM,
-    Method,
-    compare,
-    compared_pairs,
-    curve_chart,
-    curve_table,
-    verdict,
-)
 from experiments.paper.label_free import agreed_levels, measured_levels
-from experiments.study.answers import load_answers, save_answers
+from experiments.study.answers import answers_path, load_answers, save_answers
 from experiments.study.dataset import Dataset
-from experiments.study.estimates import estimate
+from experiments.study.estimates import SeedScores, compare_rows, estimate_rows
 from experiments.study.scores import score, study_settings
 from experiments.study.seed import StudySeed, supervised
 from experiments.study.stages import (
@@ -51,20 +42,15 @@ from experiments.study.stages import (
     GRPOArm,
     StudySFT,
     Weights,
-    encode_rows,
     gather_evidence,
     make_arm,
     noise_bank,
     probe_features,
-    run_decoder,
-    run_grpo,
-    run_sft,
 )
 from experiments.study.study import SMOKE as SMOKE_STUDY
 from experiments.study.study import Study, StudyConfig, open_study_data
 from experiments.study.training import DECODER, starting_model
 from sensors_io.schema import SENSORS
-from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import TouchPolicy, build_policy, check_model, with_lora
@@ -80,6 +66,13 @@ from touchr1_jax.types import Params
 from touchr1_jax.validation import at_least
 
 REWARDS: Weights = {"exact": 0.9, "format": 0.1}
+
+Method = Literal["sft", "two_phases", "grpo", "agreement", "physics"]
+METHODS: tuple[Method, ...] = ("sft", "two_phases", "grpo", "agreement", "physics")
+
+RANDOM, PRETRAINED = "random", "pretrained"  # encoders that SFT starts from
+
+COMPARED = ("acc", "omae", "mat_acc")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -122,24 +115,16 @@ class FewLabelsConfig(StudyConfig):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class LabelledSet:
-    """One seed's training on some labelled contacts from one encoder.
+class LabelledSet(StudySeed):
+    """One seed's training on some labelled contacts, the part `sft` of its data; `grpo` are those without labels.
 
-    Attributes:
-      data: its part `sft` are the labelled contacts, `grpo` those without labels.
-      tactile: parameters of the pretrained encoder, or none.
-      measured: levels that measured physics implies, int [contact, A], −1 where it implies none.
-      name: of the set, in stages and files.
+    `tactile` are parameters of the pretrained encoder, `measured` the levels that measured physics implies, int
+    [contact, A], −1 where it implies none; `name` is that of the set in stages and files.
     """
 
     config: FewLabelsConfig
-    context: Context
-    data: Dataset
-    policy: TouchPolicy
-    evidence: np.ndarray
     tactile: Params | None
     measured: np.ndarray
-    seed: int
     name: str
 
     def answers(self) -> dict[Method, Evaluation]:
@@ -150,38 +135,34 @@ class LabelledSet:
         return {method: load_answers(path) for method, path in paths.items()}
 
     def _train(self) -> None:
-        config, data = self.config, self.data
-        order: dict[str, Any] = {"seed": self.seed, "share": True}
-        tactile = {} if self.tactile is None else {"tactile": self.tactile}
-        stage = f"sft/{self.name}/{self.seed}"
-        whole = run_sft(self.policy, data, self.evidence, config.sft, self.context, stage=stage, start=tactile, **order)
-        self._keep("sft", whole, encode_rows(self.policy, whole, data, data.parts["test"], self.context))
+        config, tactile = self.config, {} if self.tactile is None else {"tactile": self.tactile}
+        whole = self.run_sft(config.sft, f"sft/{self.name}", tactile)
+        self._keep("sft", whole, self.encode(whole, "test"))
         phases = dataclasses.replace(config, sft=dataclasses.replace(config.sft, steps=0))
-        of: dict[str, Any] = {"config": phases, "data": data, "policy": self.policy, "context": self.context}
-        seed = StudySeed(**of, evidence=self.evidence, seed=self.seed)
-        start = supervised(seed, tactile=self.tactile, name=self.name, share=True)
-        test, val = (encode_rows(self.policy, start, data, data.parts[part], self.context) for part in ("test", "val"))
-        known, free = self._contacts(start)
-        stage = f"decoder/{self.name}/{self.seed}"
-        held_out = val, data.labels("val")
-        longer = run_decoder(self.policy, known, held_out, config.decoder, start, self.context, stage=stage, **order)
+        start = supervised(dataclasses.replace(self, config=phases), tactile=self.tactile, name=self.name)
+        test, validation, (known, free) = self.encode(start, "test"), self.validation(start), self._contacts(start)
+        longer = self.run_decoder(config.decoder, f"decoder/{self.name}", known, validation, start)
         self._keep("two_phases", longer, test)
-        agreed = self._implied("agreement", known, free, self._agreed(longer, free))
-        measured = self._implied("physics", known, free, self.measured[data.parts["grpo"]])
-        of_method: dict[Method, EncodedContacts] = {"grpo": known, "agreement": agreed, "physics": measured}
-        for method, contacts in of_method.items():
-            self._keep(method, self._reinforced(method, contacts, longer), test)
+        implied = {"agreement": self._agreed(longer, free), "physics": self.measured[self.data.parts["grpo"]]}
+        contacts = {"grpo": known, **{m: self._implied(m, known, free, level) for m, level in implied.items()}}
+        arm = arm_of(
+            self.policy,
+            dataclasses.replace(config.grpo, algorithm=config.algorithm(config.grpo.algorithm)),
+            config.grpo_loop,
+        )
+        for method, of in contacts.items():
+            self._keep(method, self.run_grpo(arm, f"grpo/{method}-{self.name}", of, longer), test)
 
     def _contacts(self, params: Params) -> tuple[EncodedContacts, EncodedContacts]:
         """The labelled contacts, and those without labels, whose levels are hidden."""
-        data, parts = self.data, (self.data.parts["sft"], self.data.parts["grpo"])
+        data = self.data
         noise = noise_bank(self.policy, params, data, seed=self.seed, contacts=self.config.noise_contacts)
         found = []
-        for rows, shown in zip(parts, (True, False), strict=True):
-            label = data.label[rows] if shown else np.full_like(data.label[rows], -1)
-            features = encode_rows(self.policy, params, data, rows, self.context)
-            of: dict[str, Any] = {"features": features, "label": label, "truth": label, "noise": noise}
-            found.append(EncodedContacts(**of, evidence=self.evidence[rows], full_share=FULL_SHARE))
+        for part, shown in (("sft", True), ("grpo", False)):
+            label = data.labels(part) if shown else np.full_like(data.labels(part), -1)
+            of: dict[str, Any] = {"label": label, "truth": label, "noise": noise, "full_share": FULL_SHARE}
+            evidence = self.evidence[data.parts[part]]
+            found.append(EncodedContacts(features=self.encode(params, part), evidence=evidence, **of))
         return found[0], found[1]
 
     def _agreed(self, params: Params, free: EncodedContacts) -> np.ndarray:
@@ -189,10 +170,10 @@ class LabelledSet:
         return agreed_levels(evaluate_policy(self.policy, params, free.features, ask_all), free.label)
 
     def _implied(
-        self, method: Method, known: EncodedContacts, free: EncodedContacts, level: np.ndarray
+        self, method: str, known: EncodedContacts, free: EncodedContacts, level: np.ndarray
     ) -> EncodedContacts:
         """Both kinds of contacts, those without labels with the levels that a label-free reward pays."""
-        right, asked = level == self.data.label[self.data.parts["grpo"]], level >= 0
+        right, asked = level == self.data.labels("grpo"), level >= 0
         found = [100 * float(asked.mean()), 100 * float(right[asked].mean()) if asked.any() else None]
         self.context.save_stage(f"implied/{method}-{self.name}/{self.seed}", found)
         if not asked.any():
@@ -203,20 +184,13 @@ class LabelledSet:
         evidence = np.concatenate([known.evidence, free.evidence])
         return dataclasses.replace(known, features=features, label=label, truth=label, evidence=evidence)
 
-    def _reinforced(self, method: str, contacts: EncodedContacts, start: Params) -> Params:
-        config = self.config
-        grpo = dataclasses.replace(config.grpo, algorithm=config.algorithm(config.grpo.algorithm))
-        arm = arm_of(self.policy, grpo, config.grpo_loop)
-        order: dict[str, Any] = {"seed": self.seed, "stage": f"grpo/{method}-{self.name}/{self.seed}", "share": True}
-        return run_grpo(self.policy, arm, contacts, start, self.context, **order)
-
-    def _keep(self, method: Method, params: Params, test: Features) -> None:
+    def _keep(self, method: str, params: Params, test: Features) -> None:
         if not self._path(method).exists():
             label = self.data.labels("test")
             save_answers(self._path(method), evaluate_policy(self.policy, params, test, label, alone=False))
 
-    def _path(self, method: Method) -> Path:
-        return self.context.directory / "answers" / f"{method}-{self.name}-{self.seed}.npz"
+    def _path(self, method: str) -> Path:
+        return answers_path(self.context, f"{method}-{self.name}", self.seed)
 
 
 @functools.cache
@@ -230,10 +204,10 @@ def run(config: FewLabelsConfig, context: Context) -> Results:
     check_model(config.model, SENSORS)
     data = open_study_data(config, context)
     train = data.training
-    path = pretrained_encoder(config, data, train, context)
-    model, tactile = starting_model(config.model, path, data.clip.sensors)
+    model, tactile = starting_model(config.model, pretrained_encoder(config, data, train, context), data.clip.sensors)
     policy, probed = with_lora(build_policy(model, data.clip.sensors), config.lora), probe_features(data, context)
     levels = np.array(context.once("measured", lambda: measured_levels(data.store, train).tolist()))
+    made: dict[str, Any] = {"config": config, "context": context, "policy": policy, "measured": levels, "share": True}
     answers: dict[str, list[Evaluation]] = {}
     for seed in context.each("seeds", range(config.seeds)):
         order = np.random.default_rng((seed, 31)).permutation(train)
@@ -244,15 +218,13 @@ def run(config: FewLabelsConfig, context: Context) -> Results:
                 few = with_parts(data, order[:count], order[: config.unlabelled])
             for encoder, start in ((RANDOM, None), (PRETRAINED, tactile)):
                 name = f"{min(count, len(train))}-{encoder}"
-                made: dict[str, Any] = {"config": config, "context": context, "data": few, "policy": policy}
-                made |= {"evidence": evidence, "tactile": start, "measured": levels, "seed": seed, "name": name}
-                for method, evaluation in LabelledSet(**made).answers().items():
+                of_set = LabelledSet(**made, data=few, evidence=evidence, tactile=start, seed=seed, name=name)
+                for method, evaluation in of_set.answers().items():
                     answers.setdefault(f"{method}-{name}", []).append(evaluation)
     study = Study(config=config, data=data, policy=policy, probed=probed, prior=data.prior(), arms={}, answers={})
     scored = {name: [score(study, one) for one in seeds] for name, seeds in answers.items()}
     objects = data.object_ids[data.parts["test"]][next(iter(answers.values()))[0].contact]
-    counts = [min(count, len(train)) for count in config.labelled]
-    counts = list(dict.fromkeys(counts))
+    counts = list(dict.fromkeys(min(count, len(train)) for count in config.labelled))
     return report(config, data, scored, objects, counts, implied_table(config, context, counts))
 
 
@@ -279,9 +251,8 @@ def implied_table(config: FewLabelsConfig, context: Context, counts: Sequence[in
             found = [context.load_stage(f"implied/{method}-{name}/{seed}") for seed in range(config.seeds)]
             right = [x for _, x in found if x is not None]
             share = float(np.mean([x for x, _ in found]))
-            lines.append(
-                {"set": f"{method}-{name}", "implied": share, "right": float(np.mean(right)) if right else None}
-            )
+            mean = float(np.mean(right)) if right else None
+            lines.append({"set": f"{method}-{name}", "implied": share, "right": mean})
     return named_table(
         "Levels without labels",
         lines,
@@ -294,18 +265,15 @@ def implied_table(config: FewLabelsConfig, context: Context, counts: Sequence[in
 def report(
     config: FewLabelsConfig,
     data: Dataset,
-    scored: Mapping[str, Sequence[Mapping[str, Scores]]],
+    scored: Mapping[str, SeedScores],
     objects: np.ndarray,
     counts: Sequence[int],
     implied: Table,
 ) -> Results:
     """Learning curves, their differences, and where each method pays."""
-    rows = {
-        name: {metric: estimate([s[metric] for s in seeds], objects) for metric in seeds[0]}
-        for name, seeds in scored.items()
-    }
+    rows = estimate_rows(scored, objects)
     pairs = [pair for count in counts for pair in compared_pairs(count)]
-    comparisons = [c for a, b in pairs for c in compare(scored, rows, a, b, objects)]
+    comparisons = [c for pair in pairs for c in compare_rows(*pair, COMPARED, scored, rows, objects)]
     return Results(
         verdict=verdict(comparisons, counts),
         arms=rows,
@@ -323,6 +291,85 @@ def report(
         settings={**study_settings(config), "stage 1": f"{config.pretrain.objective}, {config.pretrain.steps} steps"},
         data=data.summary(),
     )
+
+
+def compared_pairs(count: int) -> list[tuple[str, str]]:
+    """Policies that are compared: each method with the one that it starts from, and pretrained with random encoders."""
+    before: Mapping[Method, Method] = {"two_phases": "sft", "grpo": "two_phases"}
+    before = {**before, "agreement": "two_phases", "physics": "two_phases"}
+    of_methods = [(f"{a}-{count}-{e}", f"{b}-{count}-{e}") for e in (RANDOM, PRETRAINED) for a, b in before.items()]
+    of_encoders = [(f"{m}-{count}-{PRETRAINED}", f"{m}-{count}-{RANDOM}") for m in ("sft", "two_phases")]
+    return of_methods + of_encoders
+
+
+def verdict(comparisons: Sequence[Comparison], counts: Sequence[int]) -> tuple[str, ...]:
+    """For each step of training, numbers of labels at which it pays, and at which it costs, beyond both intervals."""
+    steps = {
+        "SFT in two phases": ("two_phases", "sft", None),
+        "GRPO on labelled contacts": ("grpo", "two_phases", None),
+        "agreement of sensors without labels": ("agreement", "two_phases", None),
+        "measured physics without labels": ("physics", "two_phases", None),
+        "stage 1": ("two_phases", "two_phases", PRETRAINED),
+    }
+    sentences = []
+    for title, (a, b, encoder) in steps.items():
+        pays, costs = [], []
+        for count in counts:
+            for start in (RANDOM, PRETRAINED) if encoder is None else (encoder,):
+                of = f"{a}-{count}-{start}", f"{b}-{count}-{start if encoder is None else RANDOM}"
+                found = [c for c in comparisons if (c.arm, c.against) == of and c.metric == "acc"]
+                label = f"{count} labels" + (f" ({start} encoder)" if encoder is None else "")
+                if found and all(c.low > 0 for c in found):
+                    pays.append(f"{label} {found[0].difference:+.1f}")
+                if found and all(c.high < 0 for c in found):
+                    costs.append(f"{label} {found[0].difference:+.1f}")
+        sentences.append(
+            f"{title[0].upper()}{title[1:]} raises accuracy beyond chance at {', '.join(pays) or 'no number of labels'}"
+            f" and lowers it at {', '.join(costs) or 'none'}."
+        )
+    return tuple(sentences)
+
+
+def curve_table(
+    rows: Mapping[str, Mapping[str, Estimate]], comparisons: Sequence[Comparison], counts: Sequence[int]
+) -> Table:
+    """Every policy with its difference from the one that it starts from."""
+    lines: list[dict[str, Cell]] = []
+    for encoder in (RANDOM, PRETRAINED):
+        for count in counts:
+            for method in METHODS:
+                name = f"{method}-{count}-{encoder}"
+                row = rows[name]
+                line: dict[str, Cell] = {"policy": name, "accuracy": interval(row["acc"], ".1f")}
+                line |= {"OMAE": row["omae"].mean, "material": row["mat_acc"].mean if "mat_acc" in row else None}
+                for c in comparisons:
+                    same = c.arm == name and c.metric == "acc" and c.against.endswith(f"-{encoder}")
+                    if same and c.over == "objects":
+                        line["gain"] = f"{c.difference:+.1f} {bounds(c.low, c.high, '.1f')}"
+                lines.append(line)
+    return named_table(
+        "Policies by method, labelled contacts and encoder",
+        lines,
+        formats={"OMAE": ".3f", "material": ".1f"},
+        units={"accuracy": "%", "OMAE": "levels", "material": "%", "gain": "points"},
+        meanings={"gain": "accuracy minus that of the policy that training starts from, 95 % over objects"},
+        note="sft is end to end; GRPO, agreement and physics start from two_phases.",
+    )
+
+
+def curve_chart(rows: Mapping[str, Mapping[str, Estimate]], counts: Sequence[int]) -> bytes:
+    """Draw accuracy over the number of labels, a panel for each encoder."""
+    panels = []
+    for encoder in (RANDOM, PRETRAINED):
+        series = []
+        for i, method in enumerate(METHODS):
+            found = [rows[f"{method}-{count}-{encoder}"]["acc"] for count in counts]
+            series.append(estimates(method, found, at=np.arange(len(counts)), shift=0.06 * (i - 2)))
+        ticks = {float(i): str(count) for i, count in enumerate(counts)}
+        panels.append(
+            Panel(series, title=f"{encoder} encoder", x_label="labelled contacts", y_label="right (%)", x_ticks=ticks)
+        )
+    return draw(panels, size=(10.0, 4.0))
 
 
 SMOKE = FewLabelsConfig(

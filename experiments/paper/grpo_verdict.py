@@ -27,11 +27,11 @@ from experiments.core.loops import STEPPING
 from experiments.core.results import Cell, Comparison, Estimate, Results, Table, named_table
 from experiments.core.runner import Experiment
 from experiments.core.text import bounds, interval
-from experiments.study.answers import load_answers, save_answers
+from experiments.study.answers import answers_path, load_answers, save_answers, share_right
 from experiments.study.dataset import Dataset
-from experiments.study.estimates import compare_over_objects, compare_over_seeds, estimate
+from experiments.study.estimates import SeedScores, compare_rows, estimate_rows
 from experiments.study.scores import score, study_settings
-from experiments.study.seed import CONTINUED_ORDER, StudySeed, supervised
+from experiments.study.seed import StudySeed, Validation, supervised
 from experiments.study.stages import (
     EncodedContacts,
     GRPOArm,
@@ -40,14 +40,11 @@ from experiments.study.stages import (
     gather_evidence,
     make_arm,
     probe_features,
-    run_decoder,
-    run_grpo,
 )
 from experiments.study.study import CONTINUED, SFT, Study, StudyConfig, open_study_data
 from experiments.study.study import SMOKE as SMOKE_STUDY
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS
-from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.touch_policy import TouchPolicy, build_policy, check_model, with_lora
 from touchr1_jax.rl.config import AnyAlgorithm, Cispo, Dapo, GRPOConfig, Gspo, Norm, Rloo
@@ -98,9 +95,10 @@ class GrpoVerdictConfig(StudyConfig):
 class StartedSeed(StudySeed):
     """A seed after both phases of SFT: its policy, and the encoded contacts to train, choose and score on."""
 
+    config: GrpoVerdictConfig
     params: Params
     train: EncodedContacts
-    val: Features
+    held_out: Validation
     fresh: Features
 
 
@@ -108,32 +106,27 @@ def run(config: GrpoVerdictConfig, context: Context) -> Results:
     """Train all arms, choose their rates, score once."""
     check_model(config.model, SENSORS)
     data = open_study_data(config, context)
-    fresh = data
+    fresh, rows = data, data.parts["test"]  # of recordings; of generated objects others, all of them
     if config.data == "generated":
         fresh = open_study_data(dataclasses.replace(config, scenes=config.fresh), context)
+        rows = np.arange(len(fresh.store))
     policy = with_lora(build_policy(config.model, data.clip.sensors), config.lora)
     probed = probe_features(data, context)
     study = Study(config=config, data=fresh, policy=policy, probed=probed, prior=data.prior(), arms={}, answers={})
     evidence = gather_evidence(data, probed, config.probe, context)
-    of_seed: dict[str, Any] = {"config": config, "data": data, "policy": policy, "evidence": evidence}
-    rows = fresh_rows(config, fresh)
+    made: dict[str, Any] = {"config": config, "data": data, "policy": policy, "evidence": evidence, "share": True}
     arms = made_arms(config, policy, study.prior)
     answers: dict[str, list[Evaluation]] = {name: [] for name in (SFT, CONTINUED, *arms)}
     rates: dict[str, float] = {}
     for seed in context.each("seeds", range(config.seeds)):
-        started = start_seed(StudySeed(**of_seed, context=context, seed=seed), fresh, rows)
+        started = start_seed(StudySeed(**made, context=context, seed=seed), fresh, rows)
         if not rates:
             rates = {name: chosen_rate(started, name, by_rate) for name, by_rate in arms.items()}
-        for name in answers:
+        for name, seeds in answers.items():
             train = functools.partial(train_policy, started, name, arms, rates)
-            answers[name].append(asked(started, name, train, fresh.label[rows]))
+            seeds.append(asked(started, name, train, fresh.label[rows]))
     scored = {name: [score(study, one) for one in seeds] for name, seeds in answers.items()}
     return report(config, context, scored, fresh.object_ids[rows][answers[SFT][0].contact], rates, fresh)
-
-
-def fresh_rows(config: GrpoVerdictConfig, fresh: Dataset) -> np.ndarray:
-    """Contacts that are scored: all of the fresh objects, or the test part of recordings."""
-    return np.arange(len(fresh.store)) if config.data == "generated" else fresh.parts["test"]
 
 
 def made_arms(config: GrpoVerdictConfig, policy: TouchPolicy, prior: np.ndarray) -> dict[str, dict[float, GRPOArm]]:
@@ -162,28 +155,21 @@ def algorithm_of(preset: Preset, *, exact: bool) -> AnyAlgorithm:
 
 def start_seed(of: StudySeed, fresh: Dataset, rows: np.ndarray) -> StartedSeed:
     """SFT in both phases, from the cache where a study made it, and the contacts encoded by it."""
-    config, data, policy, context, seed = of.config, of.data, of.policy, of.context, of.seed
-    params = supervised(of, share=True)
-    train, val = of.contacts(params), encode_rows(policy, params, data, data.parts["val"], context)
-    order: dict[str, Any] = {"seed": seed, "stage": f"decoder/{SFT}/{seed}", "share": True}
-    params = run_decoder(policy, train, (val, data.labels("val")), config.decoder, params, context, **order)
-    scored = encode_rows(policy, params, fresh, rows, context)
-    shared = {field.name: getattr(of, field.name) for field in dataclasses.fields(StudySeed)}
-    return StartedSeed(**shared, params=params, train=train, val=val, fresh=scored)
+    params = supervised(of)
+    train, validation = of.contacts(params), of.validation(params)
+    params = of.run_decoder(of.config.decoder, f"decoder/{SFT}", train, validation, params)
+    scored = encode_rows(of.policy, params, fresh, rows, of.context)
+    return of.extended(StartedSeed, params=params, train=train, held_out=validation, fresh=scored)
 
 
 def chosen_rate(started: StartedSeed, name: str, by_rate: Mapping[float, GRPOArm]) -> float:
     """The rate of an arm with the most right answers about validation objects, to questions about all properties."""
     if len(by_rate) == 1:
         return next(iter(by_rate))
-    label = started.data.labels("val")
 
     def right(rate: float) -> float:
         params = reinforced(started, name, rate, by_rate[rate])
-        found = evaluate_policy(started.policy, params, started.val, label, alone=False)
-        n = np.arange(len(found.contact))
-        level = np.asarray(found.parsed.conclude)[n, found.attribute]
-        return 100 * float(np.mean(level == found.label[n, found.attribute]))
+        return share_right(evaluate_policy(started.policy, params, *started.held_out, alone=False))
 
     by = started.context.once(f"rates/{name}", lambda: {str(rate): right(rate) for rate in by_rate})
     return max(by_rate, key=lambda rate: by[str(rate)])
@@ -191,31 +177,25 @@ def chosen_rate(started: StartedSeed, name: str, by_rate: Mapping[float, GRPOArm
 
 def reinforced(started: StartedSeed, name: str, rate: float, arm: GRPOArm) -> Params:
     """An arm's policy at a rate, trained once in a run."""
-    seed, stage = started.seed, f"grpo/{name}-{rate:g}/{started.seed}"
-    order: dict[str, Any] = {"seed": seed, "stage": stage, "share": True}
-    return run_grpo(started.policy, arm, started.train, started.params, started.context, **order)
+    return started.run_grpo(arm, f"grpo/{name}-{rate:g}", started.train, started.params)
 
 
 def train_policy(
     started: StartedSeed, name: str, arms: Mapping[str, Mapping[float, GRPOArm]], rates: Mapping[str, float]
 ) -> Params:
     """The policy of a row: SFT, the control, or an arm at its chosen rate."""
-    config, seed = started.config, started.seed
     if name == SFT:
         return started.params
     if name != CONTINUED:
         return reinforced(started, name, rates[name], arms[name][rates[name]])
-    if not isinstance(config, GrpoVerdictConfig):
-        raise TypeError(f"config is a {type(config).__name__}: must be a GrpoVerdictConfig, which has continued_steps")
+    config = started.config
     longer = dataclasses.replace(config.continued, steps=config.continued_steps)
-    held_out = started.val, started.data.labels("val")
-    order: dict[str, Any] = {"seed": seed + CONTINUED_ORDER, "stage": f"decoder/{CONTINUED}/{seed}", "share": True}
-    return run_decoder(started.policy, started.train, held_out, longer, started.params, started.context, **order)
+    return started.continued(longer, started.train, started.held_out, started.params)
 
 
 def asked(started: StartedSeed, name: str, train: Any, label: np.ndarray) -> Evaluation:
     """Answers of a policy about the fresh objects, kept in `answers/NAME-SEED.npz` of the run."""
-    path = started.context.directory / "answers" / f"{name}-{started.seed}.npz"
+    path = answers_path(started.context, name, started.seed)
     if not path.exists():
         params = train()
         with started.context.progress_callback(f"asking {name}") as progress:
@@ -223,38 +203,17 @@ def asked(started: StartedSeed, name: str, train: Any, label: np.ndarray) -> Eva
     return load_answers(path)
 
 
-def compared(
-    scored: Mapping[str, Sequence[Mapping[str, Scores]]],
-    rows: Mapping[str, Mapping[str, Estimate]],
-    objects: np.ndarray,
-) -> list[Comparison]:
-    """Every arm, and SFT, against the control: over objects, and over seeds where there are several."""
-    found, control = [], scored[CONTINUED]
-    for name, seeds in scored.items():
-        for metric in COMPARED if name != CONTINUED else ():
-            if metric not in rows[name]:
-                continue
-            a, b = ([one[metric] for one in side] for side in (seeds, control))
-            found.append(compare_over_objects(metric, name, CONTINUED, a, b, objects))
-            if len(seeds) > 1:
-                found.append(compare_over_seeds(metric, name, CONTINUED, rows[name][metric], rows[CONTINUED][metric]))
-    return found
-
-
 def report(
     config: GrpoVerdictConfig,
     context: Context,
-    scored: Mapping[str, Sequence[Mapping[str, Scores]]],
+    scored: Mapping[str, SeedScores],
     objects: np.ndarray,
     rates: Mapping[str, float],
     fresh: Dataset,
 ) -> Results:
     """One short table with paired intervals, and a verdict on the claim."""
-    rows = {
-        name: {metric: estimate([s[metric] for s in seeds], objects) for metric in seeds[0]}
-        for name, seeds in scored.items()
-    }
-    comparisons = compared(scored, rows, objects)
+    rows, others = estimate_rows(scored, objects), [name for name in scored if name != CONTINUED]
+    comparisons = [c for name in others for c in compare_rows(name, CONTINUED, COMPARED, scored, rows, objects)]
     return Results(
         verdict=verdict(comparisons, list(rates)),
         arms=rows,

@@ -8,29 +8,17 @@ from sensors_io.pipeline import Contacts
 from sensors_io.schema import ATTRIBUTES, UNKNOWN, Phase, Sequence
 from touchr1_jax.training.evaluation import Evaluation
 
-AGREEING = 0.75
-"""Share of the sensors that must give one level alone."""
+AGREEING = 0.75  # share of the sensors that must give one level alone
 
 BANDS = ((0.0, 0.28), (0.39, 0.61), (0.72, 1.0))
 """Ranks among all contacts that imply the levels of a property with equal shares; between them nothing is implied."""
 
-LEAST_RANKED = 30
-"""Contacts with a measured quantity below which its ranks imply nothing."""
-
-LEAST_LOAD_N = 0.5
-"""Normal force under which friction is not read."""
+LEAST_RANKED = 30  # contacts with a measured quantity below which its ranks imply nothing
+LEAST_LOAD_N = 0.5  # normal force under which friction is not read
 
 
 def agreed_levels(evaluation: Evaluation, label: Int[np.ndarray, "n A"]) -> Int[np.ndarray, "n A"]:
-    """The level of each property that at least `AGREEING` of the shown sensors conclude alone, −1 where there is none.
-
-    Args:
-      evaluation: answers with each stream alone about n contacts.
-      label: gives the shape.
-
-    Raises:
-      ValueError: answers without single streams.
-    """
+    """The level of each property that `AGREEING` of the shown sensors conclude alone, −1 without one; as `label`."""
     if evaluation.alone is None:
         raise ValueError("evaluation.alone is None: agreement needs the answers of single streams; ask them")
     found = np.full(label.shape, UNKNOWN)

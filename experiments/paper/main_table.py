@@ -20,7 +20,7 @@ chance in comparisons.  A constant already has an average of about 28.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -32,12 +32,11 @@ from experiments.paper import feature_baselines as features
 from experiments.paper import presets
 from experiments.paper.components import FULL, run_full_model
 from experiments.study import paper_numbers as paper
-from experiments.study.baselines import baselines, level_answers
 from experiments.study.controls import against_control, control_sentences, decision_table, seconds_table
 from experiments.study.estimates import compare_over_seeds
 from experiments.study.examples import rollout_examples
 from experiments.study.levels import level_report
-from experiments.study.scores import PUBLISHED, study_settings
+from experiments.study.scores import PUBLISHED, baselines, level_answers, study_settings
 from experiments.study.study import BLIND, CONTINUED, SFT, SMOKE, EvalVariant, Study, StudyConfig
 from touchr1_jax.bench.averages import AVERAGED
 from touchr1_jax.bench.questions.draw import Quota
@@ -124,29 +123,16 @@ def without_policy(study: Study, context: Context) -> dict[str, Evaluation]:
         fields = [features.field_features(data.store, rows, data.clip.sensors, advance) for rows in (train, test)]
     view = lambda row: data.store.objects[data.store.contacts[int(row)].object_id].view
     pictures = [features.picture_features([view(row) for row in rows]) for rows in (train, test)]
-    known = lambda found: features.LabelledFeatures(features=found, label=data.label[train])
-
-    def by_picture() -> features.PredictedLevels:
-        """A baseline without touch gives the same answer whichever sensor is shown."""
-        probe = functools.partial(features.linear_probe, levels=levels, config=study.config.probe)
-        together = features.together_and_alone(probe, known(pictures[0]), pictures[1]).together
-        alone = np.repeat(together[:, None], fields[1].x.shape[1], 1)
-        return features.PredictedLevels(together=together, alone=alone)
-
-    def by_fields() -> features.PredictedLevels:
-        vote = functools.partial(features.nearest, levels=levels)
-        return features.together_and_alone(vote, known(fields[0]), fields[1])
-
-    predictions: dict[str, Callable[[], features.PredictedLevels]] = {}
-    if pictures[0].present.any():
-        predictions[PICTURE] = by_picture
-    if fields[0].present.any():
-        predictions[NEAREST] = by_fields
-    answers = {}
-    for name, predict in context.each("baselines", predictions.items()):
-        found = predict()
-        answers[name] = level_answers(study.policy, study.answers[SFT][0], found.together, found.alone)
-    return baselines(study) | answers
+    probe = functools.partial(features.linear_probe, levels=levels, config=study.config.probe)
+    answers = baselines(study)
+    for name, (known, asked), predict in context.each(
+        "baselines", ((PICTURE, pictures, probe), (NEAREST, fields, functools.partial(features.nearest, levels=levels)))
+    ):
+        if known.present.any():
+            together, alone = features.together_and_alone(predict, known, data.label[train], asked)
+            single = None if name == PICTURE else alone  # of a picture the same whichever sensor is shown
+            answers[name] = level_answers(study.policy, study.answers[SFT][0], together, single)
+    return answers
 
 
 def against(rows: Mapping[str, Mapping[str, Estimate]], one: str, other: str) -> list[Comparison]:

@@ -139,8 +139,7 @@ def timed_programs(study: Study) -> TimedPrograms:
     return TimedPrograms(train=train, answer=answer, questions=len(contact), parameters=parameters)
 
 
-SizeRows = Mapping[str, Mapping[str, Mapping[str, Estimate]]]
-"""Policy → size → metric."""
+SizeRows = Mapping[str, Mapping[str, Mapping[str, Estimate]]]  # policy → size → metric
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -163,12 +162,8 @@ class SizeTrend:
 def size_trends(rows: SizeRows, costs: Mapping[str, SizeCost], metrics: Sequence[str]) -> tuple[SizeTrend, ...]:
     """Slopes of every policy and metric: for every seed a line m = a + b·log₂ N through its sizes, b over seeds.
 
-    By least squares b = Σ (x − x̄)(m − m₀) / Σ (x − x̄)² with x = log₂ N, exactly 0 where m does not change.
-
-    Args:
-      rows: policy → size → metric; every policy and size has the same seeds, two at least.
-      costs: size → parameters N.
-      metrics: those to look at; one that some size lacks is left out.
+    By least squares b = Σ (x − x̄)(m − m₀) / Σ (x − x̄)² with x = log₂ N, exactly 0 where m does not change.  A metric
+    that some size lacks is left out.
     """
     doublings = np.log2([costs[name].parameters for name in costs])
     away, found = doublings - doublings.mean(), []

@@ -14,7 +14,6 @@ Expected: a step of the encoders' head teaches them more than a step end to end,
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -24,12 +23,12 @@ from experiments.core.loops import STEPPING
 from experiments.core.results import Cell, Picture, Results, Table, named_table
 from experiments.core.runner import Experiment
 from experiments.paper.presets import CURVES
-from experiments.study.seed import StudySeed, supervised
-from experiments.study.stages import encode_rows, gather_evidence, probe_features, run_decoder
+from experiments.study.answers import asked_label, concluded
+from experiments.study.seed import StudySeed, Validation, supervised
+from experiments.study.stages import gather_evidence, probe_features
 from experiments.study.study import SMOKE, StudyConfig, open_study_data
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.metrics import ORDINAL
-from touchr1_jax.models.policy import Features
 from touchr1_jax.models.touch_policy import build_policy, with_lora
 from touchr1_jax.training.evaluation import evaluate_policy
 from touchr1_jax.types import Params
@@ -103,23 +102,21 @@ def seed_scores(
     seed: StudySeed, phase: str, steps: int, lengths: tuple[int, ...]
 ) -> dict[Lengths, Mapping[str, float]]:
     """Scores of one seed after so many steps of a phase of the encoders and each length of the decoder's phase."""
-    data, context, name = seed.data, seed.context, f"{phase.replace(' ', '_')}-{steps}"
+    context, name = seed.context, f"{phase.replace(' ', '_')}-{steps}"
     encoders = dataclasses.replace(seed.config.encoders, steps=steps if phase == HEAD else 0)
     sft = dataclasses.replace(seed.config.sft, steps=0 if phase == HEAD else steps)
-    config = dataclasses.replace(seed.config, encoders=encoders, sft=sft)
+    seed = dataclasses.replace(seed, config=dataclasses.replace(seed.config, encoders=encoders, sft=sft))
 
     def compute() -> list[Mapping[str, float]]:
-        params = supervised(dataclasses.replace(seed, config=config), name=name)
-        contacts = seed.contacts(params)
-        held_out = encode_rows(seed.policy, params, data, data.parts["val"], context), data.labels("val")
+        params = supervised(seed, name=name)
+        contacts, validation = seed.contacts(params), seed.validation(params)
         spent = trained_s(context, f"{'encoders' if phase == HEAD else 'sft'}/{name}/{seed.seed}")
         found = list[Mapping[str, float]]()
         for length in lengths:
-            stage, decoder = f"decoder/{name}-{length}/{seed.seed}", dataclasses.replace(config.decoder, steps=length)
-            order: dict[str, Any] = {"seed": seed.seed, "stage": stage}
-            longer = run_decoder(seed.policy, contacts, held_out, decoder, params, context, **order)
-            seconds = spent + trained_s(context, stage)
-            found.append({"seconds": seconds, **validation_scores(seed, longer, held_out[0])})
+            stage, decoder = f"decoder/{name}-{length}", dataclasses.replace(seed.config.decoder, steps=length)
+            longer = seed.run_decoder(decoder, stage, contacts, validation, params)
+            seconds = spent + trained_s(context, f"{stage}/{seed.seed}")
+            found.append({"seconds": seconds, **validation_scores(seed, longer, validation)})
         return found
 
     of_lengths = context.once(f"scores/{name}/{seed.seed}", compute)
@@ -131,11 +128,10 @@ def trained_s(context: Context, stage: str) -> float:
     return context.timing().get(f"{STEPPING}/{stage}", 0.0)
 
 
-def validation_scores(seed: StudySeed, params: Params, features: Features) -> Mapping[str, float]:
+def validation_scores(seed: StudySeed, params: Params, validation: Validation) -> Mapping[str, float]:
     """Accuracy and OMAE of greedy answers about the validation contacts."""
-    asked = evaluate_policy(seed.policy, params, features, seed.data.labels("val"), alone=False)
-    n = np.arange(len(asked.contact))
-    level, label = np.asarray(asked.parsed.conclude)[n, asked.attribute], asked.label[n, asked.attribute]
+    asked = evaluate_policy(seed.policy, params, *validation, alone=False)
+    level, label = concluded(asked), asked_label(asked)
     ordinal = np.isin(asked.attribute, [ATTRIBUTES.index(name) for name in ORDINAL])
     distance = np.where(level < 0, 2, np.abs(level - label))
     return {

@@ -60,10 +60,7 @@ def _study(
 ) -> StudyConfig:
     """A study on accelerators, by whole batches: micro-batches of SFT serve a processor's cache.
 
-    Args:
-      steps, lr_scale: of SFT and of GRPO.
-      batch: contacts of SFT; prompts of GRPO, and those of a micro-batch.
-      other: further settings.
+    `steps` and `lr_scale` are of SFT and of GRPO, `batch` contacts of SFT, prompts of GRPO and those of a micro-batch.
     """
     contacts, prompts, micro_prompts = batch
     optimizer = OptimizerConfig(learning_rate=1e-5, lr_scale=lr_scale[0])

@@ -27,12 +27,12 @@ from experiments.paper.bench_scores import bench_answers, bench_questions, touch
 from experiments.paper.components import FULL, run_full_model
 from experiments.paper.touch_gain import (
     TouchQuestions,
-    concluded,
     control_answers,
     control_name,
     control_variants,
     touch_questions,
 )
+from experiments.study.answers import concluded
 from experiments.study.examples import rollouts_of
 from experiments.study.paper_numbers import differences_table
 from experiments.study.scores import PUBLISHED, score_study, study_results
@@ -55,8 +55,7 @@ REPLACEMENTS = {
 OTHER_POLICIES = {SFT: "its own touch, before GRPO", BLIND: "nothing, and a policy trained so"}
 """In the same table."""
 
-SHOWN = 2
-"""Answers of each case that are shown, at most."""
+SHOWN = 2  # answers of each case that are shown, at most
 
 SHOWN_KINDS = ("compose", "compare", "order")
 """Kinds of the bench's items whose answer consists of several answers."""
@@ -77,30 +76,8 @@ class QualitativeConfig:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Conclusions:
-    """Levels that policies of one seed concluded for the same N questions, −1 for ⊥: each int [N].
-
-    `swapped` is the full model with another object's touch, `perceived` [N, S] the level that it perceives by each
-    sensor, −1 where a sensor is absent.
-    """
-
-    full: Int[np.ndarray, "N"]
-    sft: Int[np.ndarray, "N"]
-    blind: Int[np.ndarray, "N"]
-    swapped: Int[np.ndarray, "N"]
-    perceived: Int[np.ndarray, "N S"]
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class AnswerCase:
-    """A kind of answer.
-
-    Attributes:
-      title: what happens.
-      rows: bool [N], the answers of this kind.
-      among: bool [N], the questions that could have been of this kind.
-      paper: the paper's example of it, if any.
-    """
+    """A kind of answer: which are of it, which of the questions could have been, and the paper's example."""
 
     title: str
     rows: Bool[np.ndarray, "N"]
@@ -121,13 +98,11 @@ def run(config: QualitativeConfig, context: Context) -> Results:
     slots = np.asarray(full.parsed.perceive)[np.arange(len(full.contact)), :, full.attribute]
     cases = answer_cases(
         questions,
-        Conclusions(
-            full=concluded(full),
-            sft=concluded(first[SFT]),
-            blind=concluded(first[BLIND]),
-            swapped=concluded(first[control_name(FULL, "swapped")]),
-            perceived=np.where(full.streams, slots, BOTTOM),
-        ),
+        full=concluded(full),
+        sft=concluded(first[SFT]),
+        blind=concluded(first[BLIND]),
+        swapped=concluded(first[control_name(FULL, "swapped")]),
+        perceived=np.where(full.streams, slots, BOTTOM),
     )
     asks = bench_questions(study.data, config.quota, context)
     chosen = [(case.title, first_of(case.rows, questions.objects, SHOWN)) for case in cases]
@@ -143,28 +118,40 @@ def run(config: QualitativeConfig, context: Context) -> Results:
     )
 
 
-def answer_cases(questions: TouchQuestions, answers: Conclusions) -> tuple[AnswerCase, ...]:
-    """The kinds of answers that are shown."""
-    right, read = answers.full == questions.label, answers.full != BOTTOM
+def answer_cases(
+    questions: TouchQuestions,
+    *,
+    full: Int[np.ndarray, "N"],
+    sft: Int[np.ndarray, "N"],
+    blind: Int[np.ndarray, "N"],
+    swapped: Int[np.ndarray, "N"],
+    perceived: Int[np.ndarray, "N S"],
+) -> tuple[AnswerCase, ...]:
+    """The kinds of answers that are shown, from the levels that policies of one seed concluded, −1 for ⊥.
+
+    `swapped` is the full model with another object's touch, `perceived` the level that it perceives by each sensor, −1
+    where a sensor is absent.
+    """
+    right, read = full == questions.label, full != BOTTOM
     material = questions.of("material")
-    misled = questions.looks_like_another & (answers.blind != questions.label) & (answers.blind != BOTTOM)
-    known = answers.perceived != BOTTOM
-    least = np.where(known, answers.perceived, np.iinfo(answers.perceived.dtype).max).min(1)
-    split = questions.ordinal & (known.sum(1) > 1) & (least < answers.perceived.max(1))
-    two_off = read & (np.abs(answers.full - questions.label) > 1)
+    misled = questions.looks_like_another & (blind != questions.label) & (blind != BOTTOM)
+    known = perceived != BOTTOM
+    least = np.where(known, perceived, np.iinfo(perceived.dtype).max).min(1)
+    split = questions.ordinal & (known.sum(1) > 1) & (least < perceived.max(1))
+    two_off = read & (np.abs(full - questions.label) > 1)
     case = lambda title, rows, among, **paper: AnswerCase(title=title, rows=rows & among, among=among, **paper)
     return (
-        case("Hardness is right, and wrong with another object's touch", right & (answers.swapped != questions.label),
+        case("Hardness is right, and wrong with another object's touch", right & (swapped != questions.label),
              questions.of("hardness"), paper="hardness, estimated from touch"),
         case("The picture deceives about the material, touch overrules it", right, misled & material,
              paper="a conflict about the material, resolved"),
         case("The picture deceives about a level, touch overrules it", right, misled & ~material),
-        case("The picture deceives and is followed", answers.full == answers.blind, misled),
+        case("The picture deceives and is followed", full == blind, misled),
         case("Sensors disagree, the conclusion is right", right, split),
         case("Sensors disagree, the conclusion is wrong", ~right, split),
         case("Two levels off", two_off, questions.ordinal),
-        case("GRPO corrects what SFT had wrong", right, answers.sft != questions.label),
-        case("GRPO spoils what SFT had right", ~right, answers.sft == questions.label),
+        case("GRPO corrects what SFT had wrong", right, sft != questions.label),
+        case("GRPO spoils what SFT had right", ~right, sft == questions.label),
         case("Cannot be read", ~read, np.ones_like(read)),
     )  # fmt: skip
 
@@ -179,13 +166,7 @@ def first_of(rows: Bool[np.ndarray, "N"], objects: np.ndarray, count: int) -> li
 def item_examples(
     asks: Sequence[Ask], answers: Mapping[str, tuple[int, ...]], places: Mapping[Touch, int], full: Evaluation
 ) -> Iterator[tuple[str, list[int]]]:
-    """Of each of `SHOWN_KINDS` the first item answered right and the first wrong: heading, indices in `full`.
-
-    Args:
-      asks, answers: the bench's items, and id → the full model's answer.
-      places: touch → contact, as `full.contact` counts.
-      full: answers about single touches.
-    """
+    """Of each of `SHOWN_KINDS` the first item answered right and the first wrong: heading, indices in `full`."""
     index = {(int(c), int(a)): n for n, (c, a) in enumerate(zip(full.contact, full.attribute, strict=True))}
     for kind in SHOWN_KINDS:
         for wanted in (True, False):

@@ -42,8 +42,7 @@ from touchr1_jax.types import TouchBatch
 TEMPLATE = Path(__file__).parent / "chat_template.jinja"
 TEMPLATE_QWEN3 = Path(__file__).parent / "chat_template_qwen3.jinja"
 
-VOCABULARY = 640
-"""Words of the tokenizer; the table has more rows, as Qwen's has."""
+VOCABULARY = 640  # words of the tokenizer; the table has more rows, as Qwen's has
 
 ROWS = 704
 
@@ -109,10 +108,8 @@ VISION_FIELDS = {
 def write_tiny(directory: Path, language: Language, system: str = SYSTEM, decoder: DecoderConfig = SMALLEST) -> None:
     """Write config, tokenizer, template, picture settings and drawn weights in bfloat16.
 
-    Args:
-      directory: created if missing.
-      language, system: answers and text that the tokenizer is trained on, so that they are short.
-      decoder: shape of the decoder, which says which model it is; its vocabulary is `ROWS`.
+    The tokenizer is trained on the language's answers and the system's text, so that they are short.
+    The decoder's shape says which model it is; its vocabulary is `ROWS`.
     """
     directory.mkdir(parents=True, exist_ok=True)
     library = trained_tokenizer(language, system)
@@ -203,13 +200,7 @@ TEACHING_OPTIMIZER = OptimizerConfig(learning_rate=1e-5, lr_scale=300.0)
 
 
 def teach(directory: Path, steps: int, context: Context, batch_size: int = TEACHING_BATCH) -> None:
-    """Train the decoder of a checkpoint on drawn answers, and write its weights back in bfloat16.
-
-    Args:
-      directory: as `write_tiny` makes it; its weights are replaced, if there are any steps.
-      steps, batch_size: of training, logged under `STAGE`.
-      context: the run.
-    """
+    """Train the decoder of a checkpoint on drawn answers, and write its weights back in bfloat16."""
     if not steps:
         return
     found = load_checkpoint(directory, jnp.float32)

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Int
 from experiments.core.results import Cell, Table, named_table
 from experiments.core.text import interval
 from experiments.paper.feature_baselines import other_objects
+from experiments.study.answers import asked_label, concluded
 from experiments.study.estimates import RESAMPLES, pooled
 from experiments.study.seed import TrainedPolicy
 from experiments.study.study import EvalVariant, Study
@@ -59,15 +60,10 @@ def touch_questions(study: Study, answers: Evaluation) -> TouchQuestions:
     contact = study.data.parts["test"][answers.contact]
     return TouchQuestions(
         attribute=answers.attribute,
-        label=answers.label[np.arange(len(contact)), answers.attribute],
+        label=asked_label(answers),
         objects=study.data.object_ids[contact],
         looks_like_another=study.data.visual_lies[contact],
     )
-
-
-def concluded(answers: Evaluation) -> Int[np.ndarray, "N"]:
-    """The level that each answer concludes for the attribute in question, −1 for ⊥."""
-    return np.asarray(answers.parsed.conclude)[np.arange(len(answers.contact)), answers.attribute]
 
 
 def control_variants(policy: str) -> dict[str, EvalVariant]:
@@ -125,15 +121,8 @@ def touch_gain(
 ) -> TouchGain | None:
     """TUG of the accuracy over hardness, roughness and protrusion, each weighing the same; seeds pooled by question.
 
-    Args:
-      questions: the questions.
-      real: the answers of every seed given the touch.
-      controls: each of `CONTROLS` → the answers of every seed.
-      ordered: bool [N], true where the answer lies in the order of the frames.
-      mask: bool [N], the questions to judge by.
-
-    Returns:
-      The gains; `None` where fewer than two objects have such a question.
+    `controls` maps each of `CONTROLS` to the answers of every seed, `ordered` [N] is true where the answer lies in the
+    order of the frames.  There are no gains where fewer than two objects have a question of the mask [N].
     """
     mask = mask & questions.ordinal
     if len(np.unique(questions.objects[mask])) < 2:

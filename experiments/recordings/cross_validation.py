@@ -7,18 +7,20 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.optimize import minimize
+from scipy.special import log_softmax, softmax
 
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
 from experiments.core.results import Cell, Table, named_table
 from experiments.recordings.descriptions import AuxiliaryData, DescribedVideos
-from experiments.recordings.learning import LearnConfig, answer_log_probs, learn, probe_probabilities
-from experiments.recordings.level_probes import GROUPS, READINGS, SCENES
+from experiments.recordings.learning import LearnConfig, answer_log_probs, learn
+from experiments.recordings.level_probes import GROUPS, READINGS, SCENES, ProbedVideos
 from sensors_io.touches import families
 from touchr1_jax.bench.metrics import Scores, accuracy, mean_accuracy, ordinal_mae
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
 from touchr1_jax.models.description_policy import COMBINATIONS, LANGUAGE, LEVELS, choose, utility
-from touchr1_jax.training.kernel_probe import standardise
+from touchr1_jax.training.kernel_probe import object_weights, standardise
 
 SHARPNESS = 3.0  # power of a probe's probabilities: ridge regression shrinks them, as `reading_lesson` says
 
@@ -37,10 +39,7 @@ def deal_folds(objects: np.ndarray, label: Int[np.ndarray, "n A"], count: int, s
     """Fold of each video, all of an object in one, objects of one combination of levels spread over the folds.
 
     Objects are dealt in turn, combination by combination, in the order of a hash, so that neither the order of the
-    videos nor the random generator's version matters.
-
-    Raises:
-      ConfigurationError: fewer objects than folds.
+    videos nor the random generator's version matters; they must be as many as folds.
     """
     names, first = np.unique(objects, return_index=True)
     if len(names) < count:
@@ -73,15 +72,9 @@ def intervals(answer: np.ndarray, label: np.ndarray, objects: np.ndarray) -> dic
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CrossValidation:
-    """A partition of labelled videos into folds, on which policies and probes are compared.
+    """A partition of labelled videos into folds by object, on which policies and probes are compared.
 
-    Attributes:
-      config: the policy.
-      videos: labelled videos.
-      auxiliary: scenes and unlabelled videos.
-      fold: of each video, int [n]; all videos of an object are in one.
-      seed: of the partition, and of what is trained on it.
-      context: keeps finished folds, log and times.
+    `seed` is that of the partition and of what is trained on it; `context` keeps finished folds, log and times.
     """
 
     config: LearnConfig
@@ -111,13 +104,14 @@ class CrossValidation:
         self, config: LearnConfig | None = None, auxiliary: AuxiliaryData | None = None, objects: int | None = None
     ) -> Float[np.ndarray, "n 27"]:
         """As `policy`, by probes alone that learn from so many of the objects of the other folds, all by default."""
-        videos, found = self.videos, np.zeros((len(self.videos.names), len(COMBINATIONS)))
+        config, auxiliary, videos = config or self.config, auxiliary or self.auxiliary, self.videos
+        found = np.zeros((len(videos.names), len(COMBINATIONS)))
         for k in self.context.each("probes", np.unique(self.fold)):
             names = np.unique(videos.objects[self.fold != k])
             kept = np.random.default_rng(0).permutation(names)[:objects]
             training, out = videos.rows(np.isin(videos.objects, kept)), self.fold == k
-            p = probe_probabilities(config or self.config, training, auxiliary or self.auxiliary, videos.rows(out))
-            found[out] = joint_log_prob(p)
+            read = ProbedVideos(training, auxiliary, videos.rows(out), config.evidence)
+            found[out] = joint_log_prob(read.evidence())
         return found
 
     def policy_variants(self) -> dict[str, np.ndarray]:
@@ -183,8 +177,8 @@ class CrossValidation:
         known = np.zeros_like(videos.label)
         for k in self.context.each("touched before", np.unique(trial)):
             out = trial == k
-            p = probe_probabilities(config, videos.rows(~out), self.auxiliary, videos.rows(out))
-            known[out] = choose(joint_log_prob(p))
+            read = ProbedVideos(videos.rows(~out), self.auxiliary, videos.rows(out), config.evidence)
+            known[out] = choose(joint_log_prob(read.evidence()))
         return {
             "probes": choose(self.probes()),
             "probes, the object was touched before": known,
@@ -240,6 +234,76 @@ def agreement(answer: Int[np.ndarray, "n A"], objects: np.ndarray) -> float:
         same += (alike.sum() - len(mine)) / 2
         pairs += len(mine) * (len(mine) - 1) // 2
     return 100 * same / max(pairs, 1)
+
+
+PENALTY = 100.0  # λ of the logistic regression, chosen from 10, 100 and 1000 on other partitions
+
+
+def constants(
+    label: Int[np.ndarray, "n A"], objects: np.ndarray, fold: Int[np.ndarray, "n"]
+) -> dict[str, Int[np.ndarray, "n A"]]:
+    """Answers without touch: per attribute and joint mode of the training objects of each fold."""
+    answers = {name: np.zeros_like(label) for name in ("constant, each attribute's mode", "constant, joint mode")}
+    for k in np.unique(fold):
+        weight = object_weights(objects, fold != k)
+        each = [np.bincount(label[:, a], weight, LEVELS).argmax() for a in range(label.shape[1])]
+        joint = np.bincount((label * LEVELS ** np.arange(label.shape[1])[::-1]).sum(1), weight, len(COMBINATIONS))
+        for rows, level in zip(answers.values(), (each, COMBINATIONS[joint.argmax()]), strict=True):
+            rows[fold == k] = level
+    return answers
+
+
+def logistic(videos: DescribedVideos, fold: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n 27"]:
+    """Log-probabilities by multinomial logistic regression on the description, one for each attribute and fold.
+
+    The description (`sensors_io.touches`) holds the hand features: texture by octave, edges, contact area, and growth,
+    motion and decay over the video.
+    """
+    found = np.zeros((*videos.label.shape, LEVELS))
+    for k in np.unique(fold):
+        fit = fold != k
+        z, weight = standardise(videos.x.astype(np.float64), fit), object_weights(videos.objects, fit)[fit]
+        for a in range(videos.label.shape[1]):
+            coefficient = _fit(z[fit], np.eye(LEVELS)[videos.label[fit, a]], weight / weight.mean())
+            found[~fit, a] = softmax(z[~fit] @ coefficient[:-1] + coefficient[-1], -1)
+    return joint_log_prob(found, sharpness=1.0)
+
+
+def _fit(z: np.ndarray, target: np.ndarray, weight: np.ndarray) -> Float[np.ndarray, "D+1 K"]:
+    """Coefficients and, last, intercepts that minimise Σ w CE + λ/2 ‖coefficients‖²."""
+    shape = (z.shape[1] + 1, LEVELS)
+
+    def loss(flat: np.ndarray) -> tuple[float, np.ndarray]:
+        b = flat.reshape(shape)
+        log = log_softmax(z @ b[:-1] + b[-1], -1)
+        error = weight[:, None] * (np.exp(log) - target)
+        slope = np.concatenate([z.T @ error + PENALTY * b[:-1], error.sum(0, keepdims=True)])
+        return -(weight[:, None] * target * log).sum() + PENALTY / 2 * (b[:-1] ** 2).sum(), slope.ravel()
+
+    return minimize(loss, np.zeros(shape).ravel(), jac=True, method="L-BFGS-B").x.reshape(shape)
+
+
+def people(videos: DescribedVideos) -> dict[int, Int[np.ndarray, "n"]]:
+    """Levels of each rated attribute by the ratings, cut at two thresholds that fit all other objects best.
+
+    Keys are positions of attributes; those that nobody rated are missing, and so are all if there are no ratings.
+    """
+    names, first = np.unique(videos.objects, return_index=True)
+    member = np.searchsorted(names, videos.objects)
+    found = {}
+    for a in range(videos.label.shape[1]):
+        rating, level = videos.rating[first, a], videos.label[first, a]
+        if not np.isfinite(rating).all():
+            continue
+        at = np.unique(rating)
+        cuts = [(low, high) for i, low in enumerate(at) for high in at[i:]]
+        cut = np.array([(rating >= low).astype(int) + (rating >= high) for low, high in cuts])
+        right = cut == level
+        others = right.sum(1)[:, None] - right
+        best = others == others.max(0)
+        middle = [int(np.median(cut[best[:, i], i])) for i in range(len(names))]
+        found[a] = np.array(middle)[member]
+    return found
 
 
 def score_table(

@@ -2,7 +2,6 @@
 
 import dataclasses
 import hashlib
-import io
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -10,10 +9,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from experiments.core.artifacts import write_bytes
 from experiments.core.context import Context
 from experiments.study.sources import SourceConfig, prepare_records
-from sensors_io.arrays import ArraysError, load_arrays
 from sensors_io.errors import MALFORMED
 from sensors_io.importers.keep import ImportSourceError, Skip
 from sensors_io.importers.physiclear import read_labels
@@ -74,16 +71,10 @@ class AuxiliaryData:
 
 
 def describe_source(source: Path, frames: int, context: Context, objects: int | None = None) -> DescribedVideos:
-    """Describe the videos of a folder that holds labels.json and videos/.
+    """Describe so many frames in contact of the videos of a folder that holds labels.json and videos/.
 
-    Args:
-      source: the folder.
-      frames: frames in contact that are described of each video.
-      context: its cache keeps the descriptions.
-      objects: how many labelled objects to take, the first of the table; `None` takes all, unlabelled ones too.
-
-    Raises:
-      ImportSourceError: as `read_labels`, a ratings.json that is not as described, or not one readable video.
+    `objects` takes so many labelled ones, the first of the table; `None` takes all, unlabelled ones too.
+    `ImportSourceError` as of `read_labels` and `read_ratings`, or without one readable video.
     """
     entries = read_labels(source / "labels.json")
     if objects is not None:
@@ -100,11 +91,7 @@ def describe_source(source: Path, frames: int, context: Context, objects: int | 
 
 
 def read_ratings(path: Path) -> dict[str, Float[np.ndarray, "A"]]:
-    """Ratings of objects by people, 0 to 10, NaN for an attribute that was not rated; none where there is no file.
-
-    Raises:
-      ImportSourceError: a file that is not {"objects": {name: {attribute: number}}}.
-    """
+    """Ratings of objects by people, 0 to 10, NaN for an attribute that was not rated; none where there is no file."""
     if not path.is_file():
         return {}
     try:
@@ -115,11 +102,7 @@ def read_ratings(path: Path) -> dict[str, Float[np.ndarray, "A"]]:
 
 
 def videos_of(places: Sequence[Path]) -> list[Path]:
-    """The videos that are named, a folder standing for those in it.
-
-    Raises:
-      ImportSourceError: no such video or folder, or a folder without a video.
-    """
+    """The videos that are named, a folder standing for those in it; `ImportSourceError` where there is none."""
     files = []
     for place in places:
         inside = sorted(p for p in place.iterdir() if p.suffix.lower() in SUFFIXES) if place.is_dir() else [place]
@@ -130,11 +113,7 @@ def videos_of(places: Sequence[Path]) -> list[Path]:
 
 
 def describe_files(files: Sequence[Path], frames: int, context: Context) -> DescribedVideos:
-    """Describe videos without labels.
-
-    Raises:
-      ImportSourceError: not one that can be read.
-    """
+    """Describe videos without labels."""
     unknown = np.full((len(files), len(LANGUAGE.attributes)), -1, np.int32)
     return _describe_files(files, np.array([p.name for p in files]), unknown, frames, context)
 
@@ -211,16 +190,6 @@ def describe_scenes(config: SceneConfig, context: Context) -> tuple[np.ndarray, 
 def _cached(
     context: Context, name: str, identity: Sequence[object], make: Callable[[], dict[str, np.ndarray]]
 ) -> dict[str, np.ndarray]:
-    """Arrays from a file of the cache that is named by the hash of an identity; made first if it is missing."""
+    """Arrays from a file of the cache that is named by the hash of an identity."""
     digest = hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:16]
-    path = context.cache_dir / f"{name}-{digest}.npz"
-    if path.exists():
-        try:
-            return load_arrays(path)
-        except ArraysError as error:
-            context.print(f"{error}: it is made again")
-    buffer = io.BytesIO()
-    arrays = make()
-    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
-    write_bytes(path, buffer.getvalue())
-    return arrays
+    return context.cached_arrays(f"{name}-{digest}", make, compressed=True)

@@ -35,12 +35,7 @@ BINS = (0.0, 0.2, 0.35, 0.5, 0.65, 0.8, 1.001)  # of stated probabilities
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class JudgedAnswers:
-    """Log-probabilities of the answers to the same n videos on P partitions, and the truth.
-
-    Args:
-      log_prob: one row for each video.
-      label, objects: of the videos.
-    """
+    """Log-probabilities of the answers to the same n videos on P partitions, and the truth."""
 
     log_prob: Float[np.ndarray, "P n 27"]
     label: Int[np.ndarray, "n A"]

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import hashlib
-import io
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +14,7 @@ import numpy as np
 from flax import traverse_util
 from jaxtyping import Float
 
-from experiments.core.artifacts import jsonable, write_bytes
+from experiments.core.artifacts import jsonable, write_arrays
 from experiments.core.context import Context
 from experiments.core.loops import stage_hooks
 from experiments.recordings.descriptions import ROWS, AuxiliaryData, DescribedVideos
@@ -79,12 +78,7 @@ def learn(
 ) -> TrainedEnsemble:
     """Train every member on labelled videos.
 
-    Args:
-      config, training, auxiliary: the ensemble, its labelled videos, scenes and unlabelled videos.
-      seed: of members and folds; member m has 1000 · seed + m, but its training on made-up evidence does not depend
-        on it.
-      context: keeps log, times and checkpoints.
-      stage: name of the stage; training on made-up evidence is `reading/…`, GRPO `grpo/…`.
+    Member m has seed 1000 · seed + m, on which its training on made-up evidence, stage `reading/…`, does not depend.
     """
     policy, seeds = description_policy(config.shape), [1000 * seed + m for m in range(config.members)]
     with context.timed(stage):
@@ -131,22 +125,13 @@ def answer_log_probs(
 ) -> Float[np.ndarray, "n 27"]:
     """Log-probabilities of every conclusion about objects, known or not; levels of the videos are ignored.
 
-    Args:
-      trained, videos: the ensemble, and the videos that it reads.
-      asked: rows of the videos that each prompt holds; by default a prompt for each video.
+    `asked` are the rows of the videos that each prompt holds; by default a prompt for each video.
     """
     config = trained.config
     p = ProbedVideos(trained.training, trained.auxiliary, videos, config.evidence).evidence()
     rows = [np.array([i]) for i in range(len(p))] if asked is None else asked
     x = jnp.asarray(_padded(evidence_inputs(_prompts(p, rows, config.shape.contacts))), jnp.float32)
     return jax.device_get(description_policy(config.shape).posterior(trained.params, x))[: len(rows)]
-
-
-def probe_probabilities(
-    config: LearnConfig, training: DescribedVideos, auxiliary: AuxiliaryData, videos: DescribedVideos
-) -> Float[np.ndarray, "n A K"]:
-    """Probabilities of the probes without a policy."""
-    return ProbedVideos(training, auxiliary, videos, config.evidence).evidence()
 
 
 def _lesson(config: LearnConfig, read: ProbedVideos, training: DescribedVideos, seed: int) -> Lesson:
@@ -185,9 +170,7 @@ def save(path: Path, trained: TrainedEnsemble) -> None:
     """Publish an ensemble as one file."""
     videos = {name: getattr(trained.training, name) for name in ROWS}
     parts = {"params": trained.params, "training": videos, "auxiliary": dict(vars(trained.auxiliary))}
-    buffer = io.BytesIO()
-    np.savez(buffer, identity=identity(trained.config), **traverse_util.flatten_dict(parts, sep="/"))
-    write_bytes(path, buffer.getvalue())
+    write_arrays(path, {"identity": identity(trained.config), **traverse_util.flatten_dict(parts, sep="/")})
 
 
 def identity(config: LearnConfig) -> str:
@@ -196,11 +179,7 @@ def identity(config: LearnConfig) -> str:
 
 
 def load(path: Path, config: LearnConfig) -> TrainedEnsemble:
-    """The ensemble that `save` published.
-
-    Raises:
-      ImportSourceError: no such file, or a policy of another configuration.
-    """
+    """The ensemble that `save` published, of the same configuration."""
     if not path.is_file():
         raise ImportSourceError(f"policy is {path}: no such file; train one, or name a run's policy.npz")
     arrays = load_arrays(path)

@@ -29,8 +29,7 @@ from touchr1_jax.training.kernel_probe import (
     standardise,
 )
 
-READINGS = ("standardised", "ranked")
-"""Ways in which numbers of the two worlds are made comparable."""
+READINGS = ("standardised", "ranked")  # ways in which numbers of the two worlds are made comparable
 
 GROUPS = {"all": ("levels", "material", "physics"), "named": ("levels", "material"), "graded": ("levels", "physics")}
 """Groups of the properties of scenes, each read by a probe of its own."""

@@ -29,13 +29,16 @@ from experiments.core.errors import ConfigurationError
 from experiments.core.results import Requirement, Results, at_least, at_most, named_table
 from experiments.core.runner import Experiment
 from experiments.core.text import interval
-from experiments.recordings.baselines import constants, logistic, people
+from experiments.recordings import findings
 from experiments.recordings.cross_validation import (
     CrossValidation,
     agreement,
+    constants,
     deal_folds,
     intervals,
+    logistic,
     marginals,
+    people,
     pool,
     score_table,
 )
@@ -46,17 +49,6 @@ from experiments.recordings.descriptions import (
     describe_files,
     describe_source,
     videos_of,
-)
-from experiments.recordings.findings import (
-    NAMES,
-    JudgedAnswers,
-    abstention,
-    confusions,
-    gains,
-    object_table,
-    partition_table,
-    people_table,
-    sim_to_real,
 )
 from experiments.recordings.learning import LearnConfig, answer_log_probs, identity, learn, load, save
 from sensors_io.scenes.config import SceneConfig
@@ -107,11 +99,7 @@ class PhysiclearStudy:
 
 
 def run(config: PhysiclearStudy, context: Context) -> Results:
-    """Validate and train, or predict.
-
-    Raises:
-      ConfigurationError: data_dir is missing, or one of predict and out.
-    """
+    """Validate and train, or predict; `ConfigurationError` without data_dir, or with one of predict and out alone."""
     if bool(config.predict) != (config.out is not None):
         raise ConfigurationError(f"predict is {config.predict}, out {config.out}: give both to predict, or neither")
     if config.out is not None:
@@ -152,10 +140,10 @@ def in_words(log_prob: np.ndarray) -> dict[str, object]:
         f"{a.levels[k][0]} ({p[i, k]:.0%})" for i, (a, k) in enumerate(zip(LANGUAGE.attributes, level, strict=True))
     ]
     sentence = f"{', '.join(words)}; all three {whole:.0%}" + (": unsure, touch it again" if whole < UNSURE else "")
-    levels = dict(zip(NAMES, level.tolist(), strict=True))
+    levels = dict(zip(findings.NAMES, level.tolist(), strict=True))
     return levels | {
         "words": sentence,
-        "probabilities": dict(zip(NAMES, p.tolist(), strict=True)),
+        "probabilities": dict(zip(findings.NAMES, p.tolist(), strict=True)),
         "all right": whole,
     }
 
@@ -170,7 +158,7 @@ def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Resul
         config=config.learn, videos=videos, auxiliary=auxiliary, fold=fold(seed), seed=seed, context=context
     )
     blind, elsewhere = [split(seed) for seed in config.seeds], split(DEVELOPMENT)
-    gather = lambda rows: JudgedAnswers(log_prob=np.array(rows), label=videos.label, objects=videos.objects)
+    gather = lambda rows: findings.JudgedAnswers(log_prob=np.array(rows), label=videos.label, objects=videos.objects)
     policy = gather([one.policy(config.learn, "fold") for one in blind])
     pooled = gather([pool(rows, videos.objects) for rows in policy.log_prob])
     spent = training_time(context.timing(), config.seeds[0])
@@ -189,23 +177,23 @@ def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Resul
     }
     parts = elsewhere.probe_variants() | (elsewhere.policy_variants() if config.ablations else {})
     score = lambda title, rows, note: score_table(title, rows, videos.label, videos.objects, note)
-    curve, curve_table = sim_to_real(elsewhere)
+    curve, curve_table = findings.sim_to_real(elsewhere)
     main = intervals(policy.levels, policy.truth, policy.owner)
     all_videos = intervals(pooled.levels, policy.truth, policy.owner)
-    gain = gains(policy, regression)
+    gain = findings.gains(policy, regression)
     return Results(
         verdict=verdict(main, all_videos, gain, videos, len(config.seeds)),
         requirements=requirements(main, all_videos, policy.of_surest(HALF), gain, spent),
         tables=(
             score_table("Unseen objects", methods, policy.truth, policy.owner, "Mean over the partitions."),
-            partition_table(policy, pooled, config.seeds),
-            people_table(people(videos), videos),
+            findings.partition_table(policy, pooled, config.seeds),
+            findings.people_table(people(videos), videos),
             curve_table,
             score("What contributes", {name: choose(rows) for name, rows in parts.items()}, _ELSEWHERE),
             score("What limits", elsewhere.label_limits(), _LIMITS),
-            object_table(videos, policy, pooled),
+            findings.object_table(videos, policy, pooled),
         ),
-        pictures=(abstention(policy), curve, confusions(policy)),
+        pictures=(findings.abstention(policy), curve, findings.confusions(policy)),
         settings=settings(config, policy, videos),
         data={
             "objects": len(np.unique(videos.objects)),
@@ -217,7 +205,7 @@ def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Resul
     )
 
 
-def settings(config: PhysiclearStudy, policy: JudgedAnswers, videos: DescribedVideos) -> dict[str, object]:
+def settings(config: PhysiclearStudy, policy: findings.JudgedAnswers, videos: DescribedVideos) -> dict[str, object]:
     """Settings that the report names."""
     model = description_policy(config.learn.shape)
     params = jax.eval_shape(lambda key: model.fresh(key, config.learn.inputs), jax.random.key(0))

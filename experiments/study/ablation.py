@@ -32,8 +32,7 @@ SFT_CURVES: Mapping[str, tuple[str, ...]] = {
 }
 """Of the phases of SFT the scalars that are drawn."""
 
-OWN_REWARD = "reward_trained"
-"""An arm's reward under its own weights, on what GRPO asks about."""
+OWN_REWARD = "reward_trained"  # an arm's reward under its own weights, on what GRPO asks about
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -7,8 +7,7 @@ from touchr1_jax.rl.alarms import RULES, AlarmMonitor, AlarmRule
 from touchr1_jax.rl.scoring import NONFINITE_IN
 from touchr1_jax.training.loop import SKIPPED
 
-ALARM = "alarm_"
-"""Prefix of the logged metrics that hold alarms, followed by their code."""
+ALARM = "alarm_"  # prefix of the logged metrics that hold alarms, followed by their code
 
 
 def alarm_log(

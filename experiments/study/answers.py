@@ -1,34 +1,48 @@
-"""Answers of a policy to the test questions, kept as one file of a run."""
+"""Answers of a policy, kept as one file of a run; the levels that they conclude."""
 
 import dataclasses
-import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Int
 
-from experiments.core.artifacts import write_bytes
+from experiments.core.artifacts import write_arrays
+from experiments.core.context import Context
 from sensors_io.arrays import load_arrays
 from touchr1_jax.training.evaluation import Evaluation
 from touchr1_jax.types import Parsed
 
 
+def concluded(answers: Evaluation) -> Int[np.ndarray, "N"]:
+    """The level that each answer concludes for the attribute in question, −1 for ⊥."""
+    return np.asarray(answers.parsed.conclude)[np.arange(len(answers.contact)), answers.attribute]
+
+
+def asked_label(answers: Evaluation) -> Int[np.ndarray, "N"]:
+    """The level of the attribute in question."""
+    return answers.label[np.arange(len(answers.contact)), answers.attribute]
+
+
+def share_right(answers: Evaluation) -> float:
+    """Right answers in percent."""
+    return 100 * float(np.mean(concluded(answers) == asked_label(answers)))
+
+
+def answers_path(context: Context, name: str, seed: int) -> Path:
+    """Where a run keeps the answers of a policy."""
+    return context.directory / "answers" / f"{name}-{seed}.npz"
+
+
 def save_answers(path: Path, evaluation: Evaluation) -> None:
     """Publish answers as one file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     flat: dict[str, Any] = {f: getattr(evaluation, f) for f in _FLAT if getattr(evaluation, f) is not None}
     flat |= {f"parsed_{f}": getattr(evaluation.parsed, f) for f in _PARSED}
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **flat)
-    write_bytes(path, buffer.getvalue())
+    write_arrays(path, flat, compressed=True)
 
 
 def load_answers(path: Path) -> Evaluation:
-    """Answers that `save_answers` published.
-
-    Raises:
-      ValueError, KeyError: the file is damaged.
-    """
+    """Answers that `save_answers` published; a damaged file raises one of `cache.DAMAGED`."""
     arrays = load_arrays(path)
     flat: dict[str, Any] = {f: arrays.get(f) for f in _FLAT}
     parsed: dict[str, Any] = {f: arrays[f"parsed_{f}"] for f in _PARSED}

@@ -8,7 +8,6 @@ checkpoints outlive changes there.
 
 import functools
 import hashlib
-import io
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -19,7 +18,7 @@ import numpy as np
 from flax import traverse_util
 
 from experiments.core import numerics
-from experiments.core.artifacts import jsonable, write_bytes
+from experiments.core.artifacts import jsonable, write_arrays
 from experiments.core.context import Context, read_metrics
 from experiments.core.runs import ROOT, versions
 from sensors_io.arrays import load_arrays
@@ -55,8 +54,7 @@ LATER = (
 USED = ("touchr1_jax/rl/alarms.py", "touchr1_jax/rl/gradient.py", "touchr1_jax/rl/losses.py")
 """Files among `LATER` that SFT and the encoders are built on."""
 
-DAMAGED = (ValueError, KeyError)
-"""Errors of a file of the cache that is not what was written."""
+DAMAGED = (ValueError, KeyError)  # errors of a file of the cache that is not what was written
 
 _LINES = "metrics"  # entry of the file that holds the logged lines as JSON; parameters are named by their path
 
@@ -69,13 +67,9 @@ def cached(
     context: Context,
     stage: str,
 ) -> Params:
-    """The result of `train`, from the cache where an experiment already made it.
+    """The result of `train`, which logs under `stage`, from the cache where an experiment already made it.
 
-    Args:
-      kind: stage of training, which decides the source that counts.
-      values, arrays: everything else that the result depends on; arrays may be nested.
-      train: trains and logs under `stage`.
-      context, stage: of the run.
+    `kind` decides the source that counts; values and nested arrays are everything else that the result depends on.
     """
     digest = fingerprint(values, arrays, source_digest(LATER if kind == "sft" else NEVER))
     path = context.cache_dir / kind / f"{digest}.npz"
@@ -88,7 +82,8 @@ def cached(
         except DAMAGED as error:
             context.print(f"{stage}: {path} is damaged ({error}), and is made again")
     params = train()
-    context.processes.write_once(lambda: _publish(path, params, _logged(context, stage)))
+    lines = np.frombuffer(json.dumps(_logged(context, stage)).encode(), np.uint8)
+    context.processes.write_once(lambda: write_arrays(path, {_LINES: lines, **_flat(params)}))
     return params
 
 
@@ -121,18 +116,8 @@ def _flat(tree: Mapping[str, Any]) -> dict[str, Any]:
     return {name: np.asarray(x) for name, x in traverse_util.flatten_dict(tree, sep="/").items()}
 
 
-def _publish(path: Path, params: Params, lines: list[dict[str, Any]]) -> None:
-    buffer = io.BytesIO()
-    np.savez(buffer, **{_LINES: np.frombuffer(json.dumps(lines).encode(), np.uint8), **_flat(params)})
-    write_bytes(path, buffer.getvalue())
-
-
 def read_policy(path: Path) -> tuple[Params, list[dict[str, Any]]]:
-    """Parameters of a policy in the cache, and the lines that its training logged.
-
-    Raises:
-      ValueError, KeyError: the file is damaged.
-    """
+    """Parameters of a policy in the cache, and the lines that its training logged; errors are those of `DAMAGED`."""
     arrays = load_arrays(path)
     lines = json.loads(arrays.pop(_LINES).tobytes())
     return traverse_util.unflatten_dict({name: jnp.asarray(x) for name, x in arrays.items()}, sep="/"), lines

@@ -9,6 +9,7 @@ from experiments.core.context import Context
 from experiments.core.loops import STEPPING
 from experiments.core.results import Cell, Comparison, Estimate, Table, named_table
 from experiments.core.text import bounds
+from experiments.study.answers import asked_label, concluded
 from experiments.study.estimates import compare_over_seeds, object_interval
 from experiments.study.study import CONTINUED, Study
 from sensors_io.schema import ATTRIBUTES
@@ -17,8 +18,7 @@ from touchr1_jax.bench.sampled import DecisionRule, decide
 from touchr1_jax.bench.scoring import REPORTED
 from touchr1_jax.training.evaluation import Evaluation
 
-MIDDLE = 1
-"""Middle one of three ordinal levels."""
+MIDDLE = 1  # middle one of three ordinal levels
 
 
 def against_control(rows: Mapping[str, Mapping[str, Estimate]], arms: Iterable[str]) -> list[Comparison]:
@@ -108,13 +108,9 @@ RULES = (GREEDY, *get_args(DecisionRule))
 
 
 def decided_levels(answers: Evaluation, rule: str) -> np.ndarray:
-    """Level of the asked attribute, int [N], by `GREEDY` decoding or by a rule on the sampled traces.
-
-    Raises:
-      ValueError: a rule for answers without sampled traces.
-    """
+    """Level of the asked attribute, int [N], by `GREEDY` decoding or by a rule on the sampled traces."""
     if rule == GREEDY:
-        return np.asarray(answers.parsed.conclude)[np.arange(len(answers.contact)), answers.attribute]
+        return concluded(answers)
     if answers.marginal is None:
         raise ValueError("answers.marginal is None: a decision rule needs sampled traces; sample some")
     ordinal = np.isin(answers.attribute, [ATTRIBUTES.index(name) for name in ORDINAL])
@@ -125,7 +121,7 @@ def decided_levels(answers: Evaluation, rule: str) -> np.ndarray:
 def _decided(seeds: Sequence[Evaluation], objects: np.ndarray, rule: str) -> dict[str, Cell]:
     """Cells of one policy's row; levels without an order are answered by the likeliest."""
     level = np.concatenate([decided_levels(one, rule) for one in seeds])
-    label = np.concatenate([one.label[np.arange(len(one.label)), one.attribute] for one in seeds])
+    label = np.concatenate([asked_label(one) for one in seeds])
     attribute = np.concatenate([one.attribute for one in seeds])
     of = np.concatenate([objects[one.contact] for one in seeds])
     ordinal = np.isin(attribute, [ATTRIBUTES.index(name) for name in ORDINAL])

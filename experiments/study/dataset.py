@@ -83,14 +83,7 @@ def split_parts(
 ) -> dict[str, np.ndarray]:
     """Contact indices of each part; a `grpo_share` of the training objects is kept from SFT for GRPO.
 
-    Args:
-      store: the records.
-      grpo_share: of the training objects; `None` lets both stages learn from all of them.
-      seed: of the draw.
-      left_out: contacts that are in no part.
-
-    Raises:
-      DataError: no object has a label, or a part has no contact.
+    Without a share both stages learn from all of them.  `DataError` if no object has a label, or a part no contact.
     """
     train = store.contacts_of_split("train")
     ids = np.array([store.contacts[i].object_id for i in train])

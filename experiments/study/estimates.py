@@ -1,7 +1,7 @@
 """From the scores of every seed to the estimates and comparisons of the results."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -12,8 +12,8 @@ from touchr1_jax.bench import statistics
 from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.bench.scoring import REPORTED
 
-RESAMPLES = 2_000
-"""Of each interval over objects: its ends are then good to a tenth of its width."""
+SeedScores = Sequence[Mapping[str, Scores]]  # metric → scores, of every seed
+RESAMPLES = 2_000  # of each interval over objects: its ends are then good to a tenth of its width
 
 
 def object_interval(values: np.ndarray, objects: np.ndarray, spec: str = ".1f") -> str | None:
@@ -32,12 +32,7 @@ def pooled(seeds: Sequence[Scores]) -> Scores:
 
 
 def estimate(per_seed: Sequence[Scores], objects: np.ndarray) -> Estimate:
-    """Mean over seeds, and its object-clustered bootstrap interval: the seeds' values pooled, whole objects resampled.
-
-    Args:
-      per_seed: the scores of every seed on the same N questions.
-      objects: [N], the object of each question.
-    """
+    """Mean over seeds, and its object-clustered bootstrap interval: seeds pooled, whole objects [N] resampled."""
     means = tuple(scores.mean() for scores in per_seed)
     interval = statistics.clustered_bootstrap(
         np.concatenate([s.values for s in per_seed]),
@@ -46,6 +41,33 @@ def estimate(per_seed: Sequence[Scores], objects: np.ndarray) -> Estimate:
         resamples=RESAMPLES,
     )
     return Estimate(mean=float(np.mean(means)), ci95=(interval.low, interval.high), per_seed=means)
+
+
+def estimate_rows(scored: Mapping[str, SeedScores], objects: np.ndarray) -> dict[str, dict[str, Estimate]]:
+    """Estimates of every metric of every row."""
+    return {
+        name: {metric: estimate([scores[metric] for scores in seeds], objects) for metric in seeds[0]}
+        for name, seeds in scored.items()
+    }
+
+
+def compare_rows(
+    a: str,
+    b: str,
+    metrics: Iterable[str],
+    scored: Mapping[str, SeedScores],
+    rows: Mapping[str, Mapping[str, Estimate]],
+    objects: np.ndarray,
+) -> list[Comparison]:
+    """One row against another in the metrics that both have, over objects and, where there are several, over seeds."""
+    found = []
+    for metric in metrics:
+        if metric in rows[a] and metric in rows[b]:
+            ours, theirs = ([scores[metric] for scores in scored[name]] for name in (a, b))
+            found.append(compare_over_objects(metric, a, b, ours, theirs, objects))
+            if len(scored[a]) > 1:
+                found.append(compare_over_seeds(metric, a, b, rows[a][metric], rows[b][metric]))
+    return found
 
 
 def compare_over_seeds(metric: str, arm: str, against: str, a: Estimate, b: Estimate) -> Comparison:
@@ -77,9 +99,7 @@ def compare_over_objects(
 ) -> Comparison:
     """`arm` minus `against`, paired by question and seed: object-clustered bootstrap interval.
 
-    Args:
-      a, b: the scores of every seed on the same N questions; a baseline without seeds is repeated by the caller.
-      objects: [N], the object of each question.
+    A baseline without seeds is repeated by the caller.
     """
     for x, y in zip(a, b, strict=True):
         same = np.array_equal(x.items, y.items) and np.array_equal(x.strata, y.strata)

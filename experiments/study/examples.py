@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from experiments.core.results import RolloutExample, Slot, Trace
+from experiments.study.answers import asked_label, concluded
 from experiments.study.stages import Weights
 from experiments.study.study import Study
 from sensors_io.pipeline import make_clip
@@ -16,17 +17,10 @@ from touchr1_jax.text.language import SEGMENTS
 from touchr1_jax.text.template import QUESTIONS
 from touchr1_jax.training.evaluation import Evaluation, reward_terms
 
-FIELD_PX = 192
-"""Side of a drawn field."""
-
-ARROWS = 12
-"""Arrows along a side of a drawn field."""
-
-SCALE_PX = 58
-"""Width of the scale beside it."""
-
-ARROW_PX = 14.0
-"""Length of the longest arrow: it stays inside its cell."""
+FIELD_PX = 192  # side of a drawn field
+ARROWS = 12  # arrows along a side of a drawn field
+SCALE_PX = 58  # width of the scale beside it
+ARROW_PX = 14.0  # length of the longest arrow: it stays inside its cell
 
 
 def rollout_examples(
@@ -34,14 +28,10 @@ def rollout_examples(
 ) -> tuple[RolloutExample, ...]:
     """For each attribute, the first test question that the arm's first seed got right and the first it got wrong.
 
-    Args:
-      study, arm: the policy that answers.
-      weights: of the rewards that are shown.
-      instead: answers of the same policy and seed with something else in the place of the touch.
+    `instead` are answers of the same policy and seed with something else in the place of the touch.
     """
     answers = study.answers[arm][0]
-    n = np.arange(len(answers.attribute))
-    right = answers.parsed.conclude[n, answers.attribute] == answers.label[n, answers.attribute]
+    right = concluded(answers) == asked_label(answers)
     rows = []
     for a in range(len(study.policy.language.attributes)):
         for outcome in (True, False):
@@ -57,13 +47,7 @@ def rollouts_of(
     instead: Mapping[str, Evaluation] = {},
     group: str = "",
 ) -> tuple[RolloutExample, ...]:
-    """Chosen answers of the arm's first seed.
-
-    Args:
-      study, arm, weights, instead: as in `rollout_examples`.
-      rows: numbers of the answers.
-      group: heading under which they stand.
-    """
+    """Answers `rows` of the arm's first seed under the heading `group`; other arguments as in `rollout_examples`."""
     data, policy, answers = study.data, study.policy, study.answers[arm][0]
     terms = reward_terms(policy, answers, weights, study.prior)
 

@@ -23,14 +23,9 @@ from touchr1_jax.models.saved_policy import PolicyError, PolicyInput, SavedPolic
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.types import Params
 
-FIGURES = ("acc", "h_acc", "r_acc", "p_acc", "mat_acc", "omae", "parse_rate")
-"""Metrics of a model card."""
-
-POLICIES = "policies"
-"""Folder of a run with its trained policies."""
-
-SCENES = "scenes"
-"""Note with the configuration of the generated scenes that a policy was trained on."""
+FIGURES = ("acc", "h_acc", "r_acc", "p_acc", "mat_acc", "omae", "parse_rate")  # metrics of a model card
+POLICIES = "policies"  # folder of a run with its trained policies
+SCENES = "scenes"  # note with the configuration of the generated scenes that a policy was trained on
 
 ONLY_SCENES = "generated scenes only: pictures of real sensors look different, and answers about them are guesses"
 """Note on the limits of a policy that was trained on generated scenes."""
@@ -73,11 +68,7 @@ def find_policy(name: str, runs_dir: Path, weights: Path | None = None) -> Askab
     """A policy by the folder of a run, RUN, RUN/ARM or RUN/ARM/SEED, or by what `load_policy` takes.
 
     Of a run the policy of SFT and the first seed is taken, since every study has it.  A policy may lie at a URL.
-    `weights` as in `load_policy`.
-
-    Raises:
-      PolicyError: there is none, or it cannot be read.
-      StoreError: the URL cannot be read.
+    `weights` as in `load_policy`; `PolicyError` or `StoreError` if there is none that can be read.
     """
     if at_url(name):
         with tempfile.TemporaryDirectory() as copied:
@@ -130,11 +121,7 @@ def is_policy(name: str, runs_dir: Path) -> bool:
 
 
 def run_policy(name: str, runs_dir: Path) -> Path | None:
-    """The folder of a policy of a run; `None` where the name is that of no run.
-
-    Raises:
-      PolicyError: a run without this policy.
-    """
+    """The folder of a policy of a run, which must have it; `None` where the name is that of no run."""
     parts = Path(name).parts
     for count in range(len(parts), max(len(parts) - 3, 0), -1):
         try:
@@ -155,11 +142,7 @@ def run_policy(name: str, runs_dir: Path) -> Path | None:
 
 
 def clip_of(saved: SavedPolicy) -> ClipConfig:
-    """The clips that a policy reads.
-
-    Raises:
-      PolicyError: it leaves out frames by a flag that this version does not know.
-    """
+    """The clips that a policy reads; `PolicyError` if it leaves out frames by a flag that is unknown here."""
     unknown = sorted({*saved.reads.rejected} - {*Flag.__members__})
     if unknown:
         raise PolicyError(f"policy leaves out frames with the flags {', '.join(unknown)}: unknown; update touchr1-jax")

@@ -1,36 +1,50 @@
-"""One seed of a study: its SFT policy, the arms and the control that start from it, and its blind baseline."""
+"""One seed of a study: its SFT policy, the arms and the control that start from it, and its blind baseline.
+
+A stage is the library's training, filled with a run's data; its log and checkpoints are in the run's directory, so that
+a stopped run continues from its last checkpoint.
+"""
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Array
 
 from experiments.core.context import Context
-from experiments.study.answers import load_answers, save_answers
-from experiments.study.cache import DAMAGED
+from experiments.core.loops import stage_hooks
+from experiments.study.alarm_log import alarm_log
+from experiments.study.answers import answers_path, load_answers, save_answers, share_right
+from experiments.study.cache import DAMAGED, cached
 from experiments.study.dataset import Dataset
 from experiments.study.policies import policy_folder, publish_policy
 from experiments.study.stages import (
     EncodedContacts,
     GRPOArm,
+    StudySFT,
+    answer_feed,
+    computed_touch,
+    describe_sample,
     encode_rows,
     noise_bank,
-    run_decoder,
-    run_encoders,
-    run_grpo,
-    run_sft,
+    untrained,
 )
 from experiments.study.training import GRPO_ATTRIBUTES, TrainingConfig
 from sensors_io.schema import ATTRIBUTES, UNKNOWN
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.touch_policy import TouchPolicy
+from touchr1_jax.rl.config import left_out
 from touchr1_jax.training.evaluation import Evaluation, evaluate_policy
-from touchr1_jax.training.feeds import FULL_SHARE
+from touchr1_jax.training.feeds import FULL_SHARE, AnswerFeed, encoded_clips, host_touch
+from touchr1_jax.training.loop import Batches
+from touchr1_jax.training.questions import QuestionFeed
 from touchr1_jax.training.rollout_server import RolloutServer
+from touchr1_jax.training.train_encoder import touch_rows, train_encoder
+from touchr1_jax.training.train_grpo import train_grpo
+from touchr1_jax.training.train_sft import SFTConfig, train_sft
 from touchr1_jax.types import Params
 
 SFT, CONTINUED, BLIND = "sft", "sft_continued", "tactile_blind"
@@ -40,10 +54,19 @@ seconds as an arm takes, and SFT without touch."""
 CONTINUED_ORDER = 1_000
 """Added to the seed of the questions of the control, which would otherwise be those of the phase before it."""
 
+Validation = tuple[Features, np.ndarray]
+"""Features and labels of contacts; the share of right answers about them chooses a checkpoint."""
+
+S = TypeVar("S", bound="StudySeed")
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StudySeed:
-    """One seed of a study; `evidence` [contact, S, A, K] is that of its verified answers."""
+    """One seed of a study and its stages of training, each named `PHASE/SEED` or `PHASE/NAME/SEED`.
+
+    `evidence` [contact, S, A, K] is that of its verified answers.  With `share` a policy comes from the cache where an
+    experiment trained it before.
+    """
 
     config: TrainingConfig
     data: Dataset
@@ -51,6 +74,19 @@ class StudySeed:
     evidence: np.ndarray
     context: Context
     seed: int
+    share: bool = False
+
+    def extended(self, kind: type[S], **more: Any) -> S:
+        """The same seed with the further fields of a subclass."""
+        return kind(**{field.name: getattr(self, field.name) for field in dataclasses.fields(StudySeed)}, **more)
+
+    def encode(self, params: Params, part: str, *, blind: bool = False) -> Features:
+        """The contacts of a part of the data, encoded by a policy."""
+        return encode_rows(self.policy, params, self.data, self.data.parts[part], self.context, blind=blind)
+
+    def validation(self, params: Params) -> Validation:
+        """The validation contacts, encoded by a policy."""
+        return self.encode(params, "val"), self.data.labels("val")
 
     def contacts(self, params: Params) -> EncodedContacts:
         """The contacts that a policy's decoder is trained on, encoded by it (see `training.Recipe`)."""
@@ -58,7 +94,7 @@ class StudySeed:
         rows = data.parts["grpo"]
         truth = data.label[rows]
         return EncodedContacts(
-            features=encode_rows(self.policy, params, data, rows, self.context),
+            features=self.encode(params, "grpo"),
             label=np.where(np.isin(ATTRIBUTES, GRPO_ATTRIBUTES), truth, UNKNOWN) if paper else truth,
             truth=truth,
             noise=noise_bank(self.policy, params, data, seed=self.seed, contacts=self.config.noise_contacts),
@@ -73,23 +109,134 @@ class StudySeed:
             order: dict[str, Any] = {"alone": alone, "samples": samples, "progress": progress}
             return evaluate_policy(self.policy, params, features, label, **order)
 
+    def run_encoders(self, stage: str, start: Mapping[str, Any] = {}) -> Params:
+        """Training of the encoders by a linear head on the contacts of SFT; `start` as in `run_sft`."""
+        policy, data, config = self.policy, self.data, self.config.encoders
+        rows, stage = data.parts["sft"], f"{stage}/{self.seed}"
 
-def supervised(of: StudySeed, *, tactile: Params | None = None, name: str = "", share: bool = False) -> Params:
+        def train() -> Params:
+            order = self._order(config.batch_size)
+            touch = computed_touch(policy, data, self.context)
+            if touch is None:
+                feed: Batches = iter(data.batches(rows, **order).map(host_touch))
+            else:
+                feed = touch_rows(touch, rows, **order)
+            with stage_hooks(self.context, stage, config.steps) as hooks:
+                return train_encoder(policy, untrained(policy, data, self.seed) | dict(start), feed, config, hooks)
+
+        values = {"records": data.store.digest, "encoders": config, "clip": data.clip}
+        return self._shared("sft", stage, train, values, {"rows": rows, "start": start})
+
+    def run_sft(self, config: StudySFT, stage: str, start: Mapping[str, Any] = {}, *, blind: bool = False) -> Params:
+        """SFT end to end of fresh parameters, in which those of `start` take their places; blind is without touch."""
+        policy, data, stage = self.policy, self.data, f"{stage}/{self.seed}"
+
+        def train() -> Params:
+            own, devices = self._order(config.batch_size)["own"], math.prod(self.context.devices.shape[:2])
+            feed = answer_feed(
+                policy, data, self.evidence, config, seed=self.seed, blind=blind, own=own, devices=devices
+            )
+            params = untrained(policy, data, self.seed) | dict(start)
+            with stage_hooks(self.context, stage, config.steps) as hooks:
+                return train_sft(policy, params, feed, config, hooks, seed=self.seed, blind=blind)
+
+        values = {"records": data.store.digest, "config": config, "clip": data.clip, "blind": blind}
+        arrays = {"evidence": self.evidence, "rows": data.parts["sft"], "start": start}
+        return self._shared("sft", stage, train, values, arrays)
+
+    def run_decoder(
+        self,
+        config: SFTConfig,
+        stage: str,
+        contacts: EncodedContacts,
+        validation: Validation,
+        params: Params,
+        seed: int | None = None,
+    ) -> Params:
+        """SFT of the decoder alone on encoded contacts, up to its best checkpoint; `seed` is that of the questions."""
+        policy, stage, seed = self.policy, f"{stage}/{self.seed}", self.seed if seed is None else seed
+
+        def held_out(found: Params) -> float:
+            return share_right(evaluate_policy(policy, found, *validation, alone=False))
+
+        def train() -> Params:
+            order = self._order(config.batch_size) | {"seed": seed}
+            clips = encoded_clips(contacts.features, np.arange(len(contacts.truth)), contacts.truth, **order)
+            feed = AnswerFeed(policy, clips, contacts.evidence, questions=config.questions, **order)
+            with stage_hooks(self.context, stage, config.steps, scored=True) as hooks:
+                options: dict[str, Any] = {"seed": seed, "decoder_only": True, "held_out": held_out}
+                return train_sft(policy, params, feed, config, hooks, **options)
+
+        inputs = {**dataclasses.asdict(contacts.features), "truth": contacts.truth, "evidence": contacts.evidence}
+        held = {**dataclasses.asdict(validation[0]), "label": validation[1]}
+        arrays = {**params, "input": inputs, "validation": held}
+        return self._shared("grpo", stage, train, {"config": config, "seed": seed}, arrays)
+
+    def run_grpo(
+        self,
+        arm: GRPOArm,
+        stage: str,
+        contacts: EncodedContacts,
+        params: Params,
+        rollouts: RolloutServer | None = None,
+    ) -> Params:
+        """GRPO of an SFT policy's decoder with an arm's reward; alarms are logged and printed.
+
+        `rollouts` is a server that draws the rollouts; by default the step does.
+        """
+        policy, config, loop, stage = self.policy, arm.config, arm.loop, f"{stage}/{self.seed}"
+
+        def train() -> Params:
+            order = self._order(config.drawn) | {"truth": contacts.truth, "full_share": contacts.full_share}
+            order |= {"evidence": None if left_out(config.algorithm.anchor) else contacts.evidence}
+            feed = QuestionFeed(policy, contacts.features, contacts.label, **order)
+            describe = functools.partial(describe_sample, policy)
+            with stage_hooks(self.context, stage, loop.steps, make_log=alarm_log, describe=describe) as hooks:
+                more: dict[str, Any] = {"noise": contacts.noise, "seed": self.seed, "rollouts": rollouts}
+                return train_grpo(policy, params, feed, arm.score, config, loop, hooks, **more)
+
+        values = {"weights": list(arm.weights.items()), "config": config, "steps": loop.steps}
+        values |= {"full_share": contacts.full_share}
+        inputs = {**dataclasses.asdict(contacts.features), "noise": contacts.noise, "prior": arm.prior}
+        inputs |= {"label": contacts.label, "truth": contacts.truth, "evidence": contacts.evidence}
+        return self._shared("grpo", stage, train, values, {**params, "input": inputs})
+
+    def continued(self, config: SFTConfig, contacts: EncodedContacts, validation: Validation, params: Params) -> Params:
+        """The control, which continues SFT of the decoder on other questions."""
+        order = self.seed + CONTINUED_ORDER
+        return self.run_decoder(config, f"decoder/{CONTINUED}", contacts, validation, params, order)
+
+    def _order(self, batch_size: int) -> dict[str, Any]:
+        """Batches of this seed, of which the process reads its own rows."""
+        return {"batch_size": batch_size, "seed": self.seed, "own": self.context.devices.local_rows(batch_size)}
+
+    def _shared(
+        self,
+        kind: Literal["sft", "grpo"],
+        stage: str,
+        train: Callable[[], Params],
+        values: Mapping[str, Any],
+        arrays: Mapping[str, Any],
+    ) -> Params:
+        """The result of `train`, which depends on these values and arrays, from the cache where the study shares it."""
+        if not self.share:
+            return train()
+        fns, shape = self.policy.fns, self.context.devices.shape
+        common = {"model": self.policy.model, "lora": fns.lora, "seed": self.seed, "mesh": shape}
+        return cached(kind, {**common, **values}, arrays, train, self.context, stage)
+
+
+def supervised(of: StudySeed, *, tactile: Params | None = None, name: str = "") -> Params:
     """The policy of a seed before the phase of its decoder: its encoders trained by a head, then SFT end to end.
 
     `tactile` are parameters of the tactile encoder to start from, `name` is that of the policy in its stages where a
-    run trains several with one seed; `share` as in `run_sft`.
+    run trains several with one seed.
     """
     config, start = of.config, {} if tactile is None else {"tactile": tactile}
-    order: dict[str, Any] = {"seed": of.seed, "share": share}
-    ending = f"{name}/{of.seed}" if name else f"{of.seed}"
+    ending = f"/{name}" if name else ""
     if config.recipe == "touch" and config.encoders.steps:
-        order |= {"stage": f"encoders/{ending}", "start": start}
-        start = run_encoders(of.policy, of.data, config.encoders, of.context, **order)
-    if not config.sft.steps:
-        return start
-    order |= {"stage": f"sft/{ending}", "start": start}
-    return run_sft(of.policy, of.data, of.evidence, config.sft, of.context, **order)
+        start = of.run_encoders(f"encoders{ending}", start)
+    return of.run_sft(config.sft, f"sft{ending}", start) if config.sft.steps else start
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -116,7 +263,6 @@ class SeedTraining(StudySeed):
     """Its SFT checkpoint, the arms that start from it, and its blind baseline."""
 
     tactile: Params | None
-    share: bool
     arms: Mapping[str, GRPOArm]
     variants: Mapping[str, EvalVariant]
     rollouts: RolloutServer | None = None
@@ -127,68 +273,54 @@ class SeedTraining(StudySeed):
         names = (SFT, CONTINUED, *self.arms, BLIND, *self.variants)
         self.context.processes.write_once(lambda: self._drop_damaged(names))
         if not all(self._path(name).exists() for name in names):
-            self._train()
+            params, contacts, validation = self._start()
+            test = self.encode(params, "test")
+            self._evaluate_all(SFT, params, test, contacts.noise)
+            for name in (CONTINUED, *self.arms):
+                self._evaluate_all(name, self._continue(name, params, contacts, validation), test, contacts.noise)
             self._evaluate(BLIND, self._blind)
         return {name: load_answers(self._path(name)) for name in names}
-
-    def _train(self) -> None:
-        """SFT in its phases, its control, and every arm."""
-        params, contacts, more_sft = self._start()
-        test = encode_rows(self.policy, params, self.data, self.data.parts["test"], self.context)
-        self._evaluate_all(SFT, params, test, contacts.noise)
-        for name in (CONTINUED, *self.arms):
-            self._evaluate_all(name, self._continue(name, params, contacts, more_sft), test, contacts.noise)
 
     def train(self, name: str) -> None:
         """One policy alone, and those that it starts from, without answers."""
         if name == BLIND:
             self._train_blind()
             return
-        params, contacts, more_sft = self._start()
+        start = self._start()
         if name != SFT:
-            self._continue(name, params, contacts, more_sft)
+            self._continue(name, *start)
 
-    def _start(self) -> tuple[Params, EncodedContacts, Callable[..., Params]]:
-        """SFT in its phases, the contacts that it encodes, and the function that goes on with SFT of its decoder."""
-        data, policy, context, config = self.data, self.policy, self.context, self.config
-        params = supervised(self, tactile=self.tactile, share=self.share)
-        contacts = self.contacts(params)
-        held_out = encode_rows(policy, params, data, data.parts["val"], context), data.labels("val")
-        more_sft = functools.partial(run_decoder, policy, contacts, held_out, context=context, share=self.share)
-        if config.recipe == "touch":
-            params = more_sft(config.decoder, params, seed=self.seed, stage=f"decoder/{SFT}/{self.seed}")
-        return params, contacts, more_sft
+    def _start(self) -> tuple[Params, EncodedContacts, Validation]:
+        """SFT in its phases, and the contacts that it encodes to go on from there."""
+        params = supervised(self, tactile=self.tactile)
+        contacts, validation = self.contacts(params), self.validation(params)
+        if self.config.recipe == "touch":
+            params = self.run_decoder(self.config.decoder, f"decoder/{SFT}", contacts, validation, params)
+        return params, contacts, validation
 
-    def _continue(
-        self, name: str, params: Params, contacts: EncodedContacts, more_sft: Callable[..., Params]
-    ) -> Params:
+    def _continue(self, name: str, params: Params, contacts: EncodedContacts, validation: Validation) -> Params:
         """The control or an arm, from what `_start` made."""
-        if name == CONTINUED:
-            stage = f"decoder/{CONTINUED}/{self.seed}"
-            return more_sft(self.config.continued, params, seed=self.seed + CONTINUED_ORDER, stage=stage)
-        order: dict[str, Any] = {"seed": self.seed, "stage": f"grpo/{name}/{self.seed}", "share": self.share}
-        order |= {"rollouts": self.rollouts}
-        return run_grpo(self.policy, self.arms[name], contacts, params, self.context, **order)
+        if name != CONTINUED:
+            return self.run_grpo(self.arms[name], f"grpo/{name}", contacts, params, self.rollouts)
+        return self.continued(self.config.continued, contacts, validation, params)
 
     def _train_blind(self) -> Params:
-        order: dict[str, Any] = {"seed": self.seed, "stage": f"blind/{self.seed}", "share": self.share, "blind": True}
-        return run_sft(self.policy, self.data, self.evidence, self.config.blind, self.context, **order)
+        return self.run_sft(self.config.blind, "blind", blind=True)
 
     def _blind(self) -> Evaluation:
-        params, rows = self._train_blind(), self.data.parts["test"]
-        features = encode_rows(self.policy, params, self.data, rows, self.context, blind=True)
-        return self.ask(params, features, samples=self.config.samples)
+        return self.ask(
+            params := self._train_blind(), self.encode(params, "test", blind=True), samples=self.config.samples
+        )
 
     def _evaluate_all(self, name: str, params: Params, test: Features, noise: Array) -> None:
         """Save and evaluate a policy, then evaluate all variants of it."""
         publish_policy(self.policy, params, self.data, name, self.seed, self.context)
         self._evaluate(name, lambda: self.ask(params, test, samples=self.config.samples))
-        of_study = {field.name: getattr(self, field.name) for field in dataclasses.fields(StudySeed)}
         for title, variant in self.variants.items():
             if variant.of == name:
-                evaluation = load_answers(self._path(name))
+                folder, evaluation = policy_folder(self.context, name, self.seed), load_answers(self._path(name))
                 made: dict[str, Any] = {"params": params, "test": test, "noise": noise, "evaluation": evaluation}
-                trained = TrainedPolicy(**of_study, **made, folder=policy_folder(self.context, name, self.seed))
+                trained = self.extended(TrainedPolicy, **made, folder=folder)
                 self._evaluate(title, functools.partial(variant.evaluate, trained))
 
     def _evaluate(self, name: str, evaluate: Callable[[], Evaluation]) -> None:
@@ -207,4 +339,4 @@ class SeedTraining(StudySeed):
                 path.unlink()
 
     def _path(self, name: str) -> Path:
-        return self.context.directory / "answers" / f"{name}-{self.seed}.npz"
+        return answers_path(self.context, name, self.seed)

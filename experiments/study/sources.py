@@ -19,8 +19,7 @@ from sensors_io.scenes.config import SceneConfig, config_hash
 
 Source = Literal["generated", "physiclear", "records"]
 
-MOST_NAMED = 3
-"""Odd contacts that a line names."""
+MOST_NAMED = 3  # odd contacts that a line names
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -63,13 +62,7 @@ def prepare_records(config: SourceConfig, context: Context) -> Path:
 
 
 def odd_contacts(config: SourceConfig, path: Path, context: Context) -> tuple[int, ...]:
-    """Contacts of recordings of which a sequence teaches nothing about touch, listed by reason; none of generated ones.
-
-    Args:
-      config: of the experiment; `drop_odd` decides what the list says.
-      path: directory of the records.
-      context: the run.
-    """
+    """Contacts of recordings of which a sequence teaches nothing about touch, printed by reason; none of scenes."""
     if config.data == "generated":
         return ()
     store, reasons = RecordStore(path), dict[str, dict[int, str]]()

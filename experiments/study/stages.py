@@ -1,12 +1,7 @@
-"""The stages of a study: the library's training, filled with a run's data, log and checkpoints.
-
-Each is a function of its configuration and inputs; its log and checkpoints are in the run's directory, so that a
-stopped run continues from its last checkpoint.
-"""
+"""Parts of the stages of a study: probes, feeds, encoded contacts, arms, untrained policies."""
 
 import dataclasses
 import functools
-import math
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
@@ -14,33 +9,24 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from experiments.core.context import Context
-from experiments.core.loops import stage_hooks
 from experiments.core.progress import TrainingSample
-from experiments.study.alarm_log import alarm_log
-from experiments.study.cache import cached
 from experiments.study.dataset import Dataset
 from sensors_io.augment import AugmentConfig
 from sensors_io.schema import ATTRIBUTES, LEVELS
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.rewards import make_rewards
-from touchr1_jax.rl.config import GRPOConfig, left_out
+from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.scoring import ScoreFn, make_score, reward_weights
 from touchr1_jax.text.template import AND, QUESTIONS
 from touchr1_jax.training import encoding
-from touchr1_jax.training.evaluation import evaluate_policy
-from touchr1_jax.training.feeds import AnswerFeed, encoded_clips, host_touch, touch_batch
+from touchr1_jax.training.feeds import AnswerFeed, host_touch, touch_batch
 from touchr1_jax.training.linear_probe import ProbeConfig, sensor_evidence, stream_features
-from touchr1_jax.training.loop import Batches, LoopConfig
-from touchr1_jax.training.questions import QuestionFeed
-from touchr1_jax.training.rollout_server import RolloutServer
-from touchr1_jax.training.train_encoder import EncoderTrainingConfig, touch_rows, train_encoder
-from touchr1_jax.training.train_grpo import train_grpo
-from touchr1_jax.training.train_sft import SFTConfig, train_sft
+from touchr1_jax.training.loop import LoopConfig
+from touchr1_jax.training.train_sft import SFTConfig
 from touchr1_jax.types import Params, StepSample, TouchBatch
 
-Weights = Mapping[str, float]
-"""Reward → weight."""
+Weights = Mapping[str, float]  # reward → weight
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -105,39 +91,6 @@ def gather_evidence(
     )
 
 
-def run_sft(
-    policy: TouchPolicy,
-    data: Dataset,
-    evidence: np.ndarray,
-    config: StudySFT,
-    context: Context,
-    *,
-    seed: int,
-    stage: str,
-    blind: bool = False,
-    start: Params | None = None,
-    share: bool = False,
-) -> Params:
-    """SFT end to end of fresh parameters, in which those of `start` take their places; a blind policy has no touch.
-
-    With `share` the policy comes from the cache where an experiment trained it before.
-    """
-
-    def train() -> Params:
-        own, devices = context.devices.local_rows(config.batch_size), math.prod(context.devices.shape[:2])
-        feed = answer_feed(policy, data, evidence, config, seed=seed, blind=blind, own=own, devices=devices)
-        params = untrained(policy, data, seed) | (start or {})
-        with stage_hooks(context, stage, config.steps) as hooks:
-            return train_sft(policy, params, feed, config, hooks, seed=seed, blind=blind)
-
-    if not share:
-        return train()
-    values = {"records": data.store.digest, "config": config, "model": policy.model, "clip": data.clip}
-    values |= {"seed": seed, "blind": blind, "mesh": context.devices.shape, "lora": policy.fns.lora}
-    arrays = {"evidence": evidence, "rows": data.parts["sft"], "start": start or {}}
-    return cached("sft", values, arrays, train, context, stage)
-
-
 def answer_feed(
     policy: TouchPolicy,
     data: Dataset,
@@ -161,39 +114,6 @@ def answer_feed(
         packing=config.packing(devices),
         **order,
     )
-
-
-def run_encoders(
-    policy: TouchPolicy,
-    data: Dataset,
-    config: EncoderTrainingConfig,
-    context: Context,
-    *,
-    seed: int,
-    stage: str,
-    start: Params | None = None,
-    share: bool = False,
-) -> Params:
-    """Training of the encoders by a linear head on the contacts of SFT; other arguments as in `run_sft`."""
-    rows = data.parts["sft"]
-
-    def train() -> Params:
-        order: dict[str, Any] = {"batch_size": config.batch_size, "seed": seed}
-        order |= {"own": context.devices.local_rows(config.batch_size)}
-        touch = computed_touch(policy, data, context)
-        if touch is None:
-            feed: Batches = iter(data.batches(rows, **order).map(host_touch))
-        else:
-            feed = touch_rows(touch, rows, **order)
-        params = untrained(policy, data, seed) | (start or {})
-        with stage_hooks(context, stage, config.steps) as hooks:
-            return train_encoder(policy, params, feed, config, hooks)
-
-    if not share:
-        return train()
-    values = {"records": data.store.digest, "encoders": config, "model": policy.model, "clip": data.clip}
-    values |= {"seed": seed, "mesh": context.devices.shape}
-    return cached("sft", values, {"rows": rows, "start": start or {}}, train, context, stage)
 
 
 def computed_touch(policy: TouchPolicy, data: Dataset, context: Context) -> TouchBatch | None:
@@ -292,51 +212,6 @@ class EncodedContacts:
     full_share: float = 0.75
 
 
-def run_decoder(
-    policy: TouchPolicy,
-    contacts: EncodedContacts,
-    validation: tuple[Features, np.ndarray],
-    config: SFTConfig,
-    params: Params,
-    context: Context,
-    *,
-    seed: int,
-    stage: str,
-    share: bool = False,
-) -> Params:
-    """SFT of the decoder alone on encoded contacts, up to its best checkpoint; `share` as in `run_sft`.
-
-    Args:
-      policy, contacts, params, context, seed, stage: as in `run_grpo`.
-      validation: features and labels of contacts; the share of right answers about them chooses the checkpoint.
-      config: of this phase.
-    """
-
-    def held_out(found: Params) -> float:
-        asked = evaluate_policy(policy, found, *validation, alone=False)
-        n = np.arange(len(asked.contact))
-        level = np.asarray(asked.parsed.conclude)[n, asked.attribute]
-        return 100 * float(np.mean(level == asked.label[n, asked.attribute]))
-
-    def train() -> Params:
-        order: dict[str, Any] = {"batch_size": config.batch_size, "seed": seed}
-        order |= {"own": context.devices.local_rows(config.batch_size)}
-        clips = encoded_clips(contacts.features, np.arange(len(contacts.truth)), contacts.truth, **order)
-        feed = AnswerFeed(policy, clips, contacts.evidence, questions=config.questions, **order)
-        with stage_hooks(context, stage, config.steps, scored=True) as hooks:
-            options: dict[str, Any] = {"seed": seed, "decoder_only": True, "held_out": held_out}
-            return train_sft(policy, params, feed, config, hooks, **options)
-
-    if not share:
-        return train()
-    values = {"config": config, "model": policy.model, "seed": seed, "mesh": context.devices.shape}
-    values |= {"lora": policy.fns.lora}
-    inputs = {**dataclasses.asdict(contacts.features), "truth": contacts.truth, "evidence": contacts.evidence}
-    held = {**dataclasses.asdict(validation[0]), "label": validation[1]}
-    arrays = {**params, "input": inputs, "validation": held}
-    return cached("grpo", values, arrays, train, context, stage)
-
-
 def describe_sample(policy: TouchPolicy, sample: StepSample) -> TrainingSample:
     """An answer of a step in words."""
     asked = [a for a, chosen in zip(policy.language.attributes, sample.asked, strict=True) if chosen]
@@ -348,39 +223,3 @@ def describe_sample(policy: TouchPolicy, sample: StepSample) -> TrainingSample:
         truth=", ".join(known),
         reward=float(sample.reward),
     )
-
-
-def run_grpo(
-    policy: TouchPolicy,
-    arm: GRPOArm,
-    contacts: EncodedContacts,
-    params: Params,
-    context: Context,
-    *,
-    seed: int,
-    stage: str,
-    share: bool = False,
-    rollouts: RolloutServer | None = None,
-) -> Params:
-    """GRPO of an SFT policy's decoder with an arm's reward; alarms are logged and printed; `share` as in `run_sft`."""
-    config, loop = arm.config, arm.loop
-
-    def train() -> Params:
-        order: dict[str, Any] = {"batch_size": config.drawn, "seed": seed}
-        order |= {"own": context.devices.local_rows(config.drawn), "truth": contacts.truth}
-        order |= {"full_share": contacts.full_share}
-        order |= {"evidence": None if left_out(config.algorithm.anchor) else contacts.evidence}
-        feed, noise = QuestionFeed(policy, contacts.features, contacts.label, **order), contacts.noise
-        describe = functools.partial(describe_sample, policy)
-        with stage_hooks(context, stage, loop.steps, make_log=alarm_log, describe=describe) as hooks:
-            order = {"noise": noise, "seed": seed, "rollouts": rollouts}
-            return train_grpo(policy, params, feed, arm.score, config, loop, hooks, **order)
-
-    if not share:
-        return train()
-    values = {"weights": list(arm.weights.items()), "config": config, "steps": loop.steps, "lora": policy.fns.lora}
-    values |= {"model": policy.model, "seed": seed, "mesh": context.devices.shape}
-    inputs = {**dataclasses.asdict(contacts.features), "noise": contacts.noise, "prior": arm.prior}
-    inputs |= {"label": contacts.label, "truth": contacts.truth, "evidence": contacts.evidence}
-    values |= {"full_share": contacts.full_share}
-    return cached("grpo", values, {**params, "input": inputs}, train, context, stage)

@@ -4,16 +4,24 @@ The answers of a finished policy are kept in `answers/NAME-SEED.npz` of the run,
 and the policy itself in `policies/NAME/SEED`, so that it can be asked about new data (`python -m experiments ask`).
 """
 
+import contextlib
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
+from rich.console import Console
 
+from experiments.core import numerics, runs
+from experiments.core.artifacts import write_json
 from experiments.core.context import Context
+from experiments.core.errors import DataError
+from experiments.study.cache import NEVER, fingerprint, source_digest
 from experiments.study.dataset import Dataset
-from experiments.study.parts import StudyPart, train_parts
 from experiments.study.seed import BLIND, CONTINUED, SFT, EvalVariant, SeedTraining
 from experiments.study.stages import (
     GRPOArm,
@@ -24,21 +32,17 @@ from experiments.study.stages import (
     make_arm,
     probe_features,
 )
-from experiments.study.training import (
-    DECODER,
-    TrainingConfig,
-    open_data,
-    require_derived,
-    starting_model,
-)
+from experiments.study.training import DECODER, TrainingConfig, open_data, require_derived, starting_model
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS
+from sensors_io.units import WorkUnit, finish
 from touchr1_jax.models.pretrained import load_encoder
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import ModelConfig, TouchPolicy, build_policy, check_model, with_lora
 from touchr1_jax.rewards import AnyReward, RewardError, make_rewards, uniform_prior
 from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
 from touchr1_jax.text.language import TOUCH_LANGUAGE
+from touchr1_jax.training.compilation import compilations_kept, compiled_quickly
 from touchr1_jax.training.evaluation import Evaluation
 from touchr1_jax.training.rollout_server import RolloutServer
 from touchr1_jax.training.train_encoder import EncoderTrainingConfig
@@ -127,6 +131,67 @@ def run_study(
     return train_study(config, data, policy, arms, context, algorithms, variants, tactile=tactile, share=config.share)
 
 
+PARTS, PROGRAMS = "units", "compiled"
+"""Folders of the cache: of the units, each with its checkpoints until it is done, and of compiled programs."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StudyPart:
+    """One policy of one seed; those that are `first` are what the others start from."""
+
+    name: str
+    seed: int
+    first: bool
+
+
+Train = Callable[[StudyPart, Context], None]
+
+
+def train_parts(
+    train: Train, parts: Sequence[StudyPart], values: Mapping[str, Any], share: bool, context: Context
+) -> None:
+    """Have workers train the policies of a study that are not in the cache yet; they depend on `values` alone.
+
+    `DataError` if the study takes none from the cache; `LauncherError` and `UnitsError` as of `units.finish`.
+    """
+    if not share:
+        raise DataError("share is False: workers hand policies over by the cache; leave --launcher out, or set --share")
+    listed = {part: _unit(train, part, values, context.cache_dir.absolute()) for part in parts}
+    for first in (True, False):
+        units = [unit for part, unit in listed.items() if part.first == first]
+        for done, unit in enumerate(finish(units, context.launcher, context.print), 1):
+            context.print(f"{done} of {len(units)} policies {'to start from ' if first else ''}trained: {unit.name}")
+
+
+def _unit(train: Train, part: StudyPart, values: Mapping[str, Any], cache_dir: Path) -> WorkUnit:
+    digest = fingerprint({**values, "part": part}, {}, source_digest(NEVER))
+    folder, machine = cache_dir / PARTS / digest, {**numerics.machine(), **numerics.settings()}
+    quick = bool(jax.config.values["jax_disable_most_optimizations"])
+    run = functools.partial(_work, train, part, cache_dir, folder, machine, quick)
+    return WorkUnit(name=f"{part.name}/{part.seed} {digest}", run=run, done=_result(folder).exists)
+
+
+def _result(folder: Path) -> Path:
+    return folder.with_suffix(".json")
+
+
+def _work(
+    train: Train, part: StudyPart, cache_dir: Path, folder: Path, machine: Mapping[str, Any], quick: bool
+) -> None:
+    """Train one policy, in a worker; one that was killed goes on from its checkpoints."""
+    with compiled_quickly() if quick else contextlib.nullcontext(), compilations_kept(cache_dir / PROGRAMS):
+        if changes := numerics.changed(machine, {**numerics.machine(), **numerics.settings()}):
+            raise DataError(
+                f"this worker computes other bits than the driver ({', '.join(changes)}): the study would not take its "
+                "policies; use workers of the driver's kind"
+            )
+        logging.getLogger("orbax").setLevel(logging.ERROR)
+        folder.mkdir(parents=True, exist_ok=True)
+        with runs.locked(folder), contextlib.closing(Context(folder, cache_dir, Console(quiet=True))) as context:
+            train(part, context)
+            write_json(_result(folder), dataclasses.asdict(part))
+
+
 def train_part(
     config: StudyConfig, arms: Mapping[str, Weights], algorithms: Mapping[str, AnyAlgorithm], part: StudyPart,
     context: Context,
@@ -168,9 +233,7 @@ def check_arms(
 ) -> None:
     """Try every weighted reward of every arm, so that a misfit is reported before anything is made.
 
-    Raises:
-      RewardError: as `check_rewards`; it names the arm.
-      ValueError: a variant of a policy that is not there, or with the name of one.
+    `RewardError` names the arm; `ValueError` for a variant of a policy that is not there, or with the name of one.
     """
     known = rewards or make_rewards(uniform_prior([len(a.levels) for a in TOUCH_LANGUAGE.attributes]))
     for arm, weights in arms.items():
@@ -204,13 +267,10 @@ def train_study(
     share: bool = False,
     rollouts: RolloutServer | None = None,
 ) -> Study:
-    """Train every arm of every seed and evaluate every policy, with data and policy at hand.
+    """Train every arm of every seed and evaluate every policy, with data and policy at hand; see `run_study`.
 
-    Args:
-      config, data, policy, arms, context, algorithms, variants: as in `run_study`, which checks them.
-      tactile: parameters of the tactile encoder that SFT starts from; `None` starts from fresh ones.
-      share: take policies from the cache.
-      rollouts: server that draws the rollouts of GRPO; by default its steps do.
+    `tactile` are parameters of the tactile encoder that SFT starts from; with `share` policies come from the cache.
+    `rollouts` is a server that draws the rollouts of GRPO; by default its steps do.
     """
     probed = probe_features(data, context)
     study = _shared(config, data, policy, arms, algorithms, probed, context)

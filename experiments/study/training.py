@@ -27,8 +27,7 @@ from touchr1_jax.training.train_sft import SFTConfig
 from touchr1_jax.types import Params
 from touchr1_jax.validation import at_least
 
-GRPO_SHARE = 0.35
-"""Share of the training objects that SFT never sees under recipe `paper`."""
+GRPO_SHARE = 0.35  # share of the training objects that SFT never sees under recipe `paper`
 
 GRPO_ATTRIBUTES = ORDINAL
 """Attributes that GRPO asks about under recipe `paper`; the arms may differ in how they pay for the answers."""
@@ -134,11 +133,7 @@ class TrainingConfig(SourceConfig):
 
 
 def require_derived(field: str, value: int) -> None:
-    """Refuse a number of the model that the data or the language determine.
-
-    Raises:
-      ValueError: it is not 0.
-    """
+    """Refuse a number of the model that the data or the language determine."""
     if value:
         raise ValueError(f"model.{field} is {value}: must be 0, the data and the language determine it; leave it out")
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from experiments.active.encoder import belief_scale, belief_tokens
-from experiments.active.probes import PROBE, crossed
+from experiments.active.world import PROBE, crossed
 
 OBJECTS, CHOICES, LEVELS = 9, 2, 3
 

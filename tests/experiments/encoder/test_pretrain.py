@@ -12,7 +12,7 @@ from experiments.core.artifacts import read_json
 from experiments.core.context import Context, read_metrics
 from experiments.encoder import pretrain_encoder
 from experiments.encoder.pretrain import StageOneDataConfig, held_out_contacts, pretrain
-from experiments.study.stages import run_sft
+from experiments.study.seed import StudySeed
 from experiments.study.training import starting_model
 from tests.experiments import tiny
 from tests.experiments.shrunk import run_shrunk
@@ -80,6 +80,7 @@ def test_a_study_starts_from_it(directory, data, context):
     evidence = np.zeros((len(data.store), 4, 4, 9), np.float32)
     untouched = dataclasses.replace(tiny.STUDY.sft, steps=0)
     policy = build_policy(model, data.clip.sensors)
-    params = run_sft(policy, data, evidence, untouched, context, seed=0, stage="sft/0", start={"tactile": tactile})
+    seed = StudySeed(config=tiny.STUDY, data=data, policy=policy, evidence=evidence, context=context, seed=0)
+    params = seed.run_sft(untouched, "sft", {"tactile": tactile})
     jax.tree.map(np.testing.assert_array_equal, params["tactile"], load_encoder(directory).params)
     assert starting_model(tiny.STUDY.model, None, data.clip.sensors) == (tiny.STUDY.model, None)

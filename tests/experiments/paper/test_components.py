@@ -11,9 +11,10 @@ from experiments.paper.component_effects import (
     ComponentComparison,
     ComponentStep,
     component_effects,
+    diagnose,
+    training_history,
 )
 from experiments.paper.components import COMPONENTS, PUBLISHED
-from experiments.paper.failure_modes import ArmMeasurements, diagnose, training_history
 from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.rewards import make_rewards, uniform_prior
 
@@ -127,16 +128,13 @@ QUIET = {"middle_rate": 30.0, "csc": 40.0, "csc_slot": 60.0, "parse_rate": 100.0
     ],
 )
 def test_failures_show_on_test_questions(after, consistency, code):
-    arm = ArmMeasurements(history=None, after={**QUIET, **after}, before=QUIET, consistency=consistency)
-    (found,) = diagnose(arm)
+    (found,) = diagnose(None, QUIET, {**QUIET, **after}, consistency=consistency)
     assert found.startswith(f"{code}: ")
 
 
 def test_failures_show_in_training():
     rows = [*lines("b", 0, entropy=(0.8, 0.1), degenerate_share=(0.1, 0.9))]
-    codes = lambda history: [
-        text.split(":")[0] for text in diagnose(ArmMeasurements(history=history, after=QUIET, before=QUIET))
-    ]
+    codes = lambda history: [text.split(":")[0] for text in diagnose(history, QUIET, QUIET)]
     assert codes(training_history(rows, "b")) == ["F7", "F9"]
     assert codes(None) == []
     assert codes(training_history([*lines("b", 0, True, entropy=(0.8, 0.7))], "b")) == ["F9"]

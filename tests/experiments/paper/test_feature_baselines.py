@@ -1,6 +1,5 @@
 """Baselines on fixed features, on contacts whose answers are known by hand; the features of recorded contacts."""
 
-import dataclasses
 import functools
 from types import SimpleNamespace
 
@@ -10,7 +9,6 @@ import pytest
 from experiments.paper.feature_baselines import (
     CELLS,
     ContactFeatures,
-    LabelledFeatures,
     field_features,
     linear_probe,
     nearest,
@@ -29,54 +27,51 @@ def features(x, present=None) -> ContactFeatures:
 
 
 def predict(known, asked, levels, **options):
-    return together_and_alone(functools.partial(nearest, levels=levels, **options), known, asked)
+    return together_and_alone(functools.partial(nearest, levels=levels, **options), *known, asked)
 
 
-def two_streams(noise: float, seed: int = 0, n: int = 60) -> LabelledFeatures:
+def two_streams(noise: float, seed: int = 0, n: int = 60) -> tuple[ContactFeatures, np.ndarray]:
     """Stream 0 carries the level, stream 1 something else; both carry a constant too."""
     rng = np.random.default_rng(seed)
     label = np.arange(n)[:, None] % 3
     signal = np.stack([label[:, 0], np.arange(n) // 3 % 2], 1).astype(float)
     x = np.stack([signal, np.full((n, 2), 7.0)], 2)
-    return LabelledFeatures(features=features(x + noise * rng.normal(size=x.shape)), label=label)
+    return features(x + noise * rng.normal(size=x.shape)), label
 
 
 def test_neighbours_vote_by_one_over_their_distance():
-    known = LabelledFeatures(features=features([[[0.0]], [[1.0]], [[10.0]]]), label=np.array([[0], [1], [2]]))
-    found = predict(known, features([[[0.2]], [[1.1]], [[7.0]]]), (3,), neighbours=1)
-    assert found.together[:, 0].tolist() == [0, 1, 2]
-    assert found.alone.shape == (3, 1, 1)
-    known = LabelledFeatures(features=features([[[0.0]], [[3.0]], [[3.0]]]), label=np.array([[0], [1], [1]]))
-    at = lambda x: predict(known, features([[[x]]]), (2,), neighbours=3).together[0, 0]
+    known = features([[[0.0]], [[1.0]], [[10.0]]]), np.array([[0], [1], [2]])
+    together, alone = predict(known, features([[[0.2]], [[1.1]], [[7.0]]]), (3,), neighbours=1)
+    assert together[:, 0].tolist() == [0, 1, 2]
+    assert alone.shape == (3, 1, 1)
+    known = features([[[0.0]], [[3.0]], [[3.0]]]), np.array([[0], [1], [1]])
+    at = lambda x: predict(known, features([[[x]]]), (2,), neighbours=3)[0][0, 0]
     assert at(0.9) == 0  # 1/.9 against 2/2.1
     assert at(1.1) == 1  # 1/1.1 against 2/1.9
 
 
 def test_a_feature_counts_by_its_spread_and_one_without_spread_does_not():
     x = [[[0.0, 0.0, 5.0]], [[1.0, 1000.0, 5.0]]]
-    known = LabelledFeatures(features=features(x), label=np.array([[0], [1]]))
-    assert predict(known, features([[[0.1, 600.0, 9.0]]]), (2,), neighbours=1).together[0, 0] == 0
+    known = features(x), np.array([[0], [1]])
+    assert predict(known, features([[[0.1, 600.0, 9.0]]]), (2,), neighbours=1)[0][0, 0] == 0
 
 
 def test_streams_that_are_not_shared_do_not_count():
-    known = LabelledFeatures(
-        features=features([[[0.0], [9.0]], [[1.0], [0.0]]], [[True, False], [True, True]]), label=np.array([[0], [1]])
-    )
+    known = features([[[0.0], [9.0]], [[1.0], [0.0]]], [[True, False], [True, True]]), np.array([[0], [1]])
     asked = features([[[0.1], [0.0]], [[0.0], [0.0]]], [[True, True], [False, False]])
-    found = predict(known, asked, (2,), neighbours=1)
-    assert found.together[:, 0].tolist() == [0, -1]  # by the first stream alone; ⊥ where nothing was recorded
-    assert found.alone[:, :, 0].tolist() == [[0, 1], [-1, -1]]
+    together, alone = predict(known, asked, (2,), neighbours=1)
+    assert together[:, 0].tolist() == [0, -1]  # by the first stream alone; ⊥ where nothing was recorded
+    assert alone[:, :, 0].tolist() == [[0, 1], [-1, -1]]
 
 
 def test_a_probe_reads_a_stream_and_gives_bottom_where_it_is_absent():
-    known, asked = two_streams(noise=0.05), two_streams(noise=0.05, seed=1)
-    single = dataclasses.replace(known, features=known.features.only(0))
+    (known, label), (asked, truth) = two_streams(noise=0.05), two_streams(noise=0.05, seed=1)
     present = np.arange(60)[:, None] > 0
     probe = functools.partial(linear_probe, levels=LEVELS, config=ProbeConfig(iterations=20))
-    found = together_and_alone(probe, single, features(asked.features.only(0).x, present))
-    assert np.array_equal(found.together[1:], asked.label[1:])
-    assert np.array_equal(found.alone[:, 0], found.together)
-    assert found.together[0, 0] == -1
+    together, alone = together_and_alone(probe, known.only(0), label, features(asked.only(0).x, present))
+    assert np.array_equal(together[1:], truth[1:])
+    assert np.array_equal(alone[:, 0], together)
+    assert together[0, 0] == -1
 
 
 def test_other_objects_are_others_and_all_are_drawn():

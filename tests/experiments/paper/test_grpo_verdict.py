@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from experiments.core.results import Comparison, Estimate
+from experiments.paper.few_labels import verdict as curves_verdict
 from experiments.paper.grpo_verdict import algorithm_of, sure
-from experiments.paper.label_curves import verdict as curves_verdict
 from experiments.paper.model_sizes import SizeCost, grpo_step_s, size_trends
 from experiments.paper.pareto_sft import PhaseResult, efficient
 from tests.experiments import tiny

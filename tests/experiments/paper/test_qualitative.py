@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from experiments.paper.qualitative import Conclusions, answer_cases, item_examples
+from experiments.paper.qualitative import answer_cases, item_examples
 from experiments.paper.touch_gain import TouchQuestions
 from touchr1_jax.bench.items import Ask, Touch
 from touchr1_jax.training.evaluation import Evaluation
@@ -13,17 +13,17 @@ QUESTIONS = TouchQuestions(
     objects=np.array(["a", "b", "b", "c", "d"]),
     looks_like_another=np.array([False, True, True, True, False]),
 )
-CONCLUSIONS = Conclusions(
-    full=np.array([0, 0, 2, 5, -1]),
-    sft=np.array([1, 2, 2, 5, 7]),
-    blind=np.array([0, 0, 1, 4, 4]),
-    swapped=np.array([2, 0, 2, 5, 7]),
-    perceived=np.array([[0, 1], [0, 0], [2, 1], [5, 4], [-1, -1]]),
-)
+CONCLUDED = {
+    "full": np.array([0, 0, 2, 5, -1]),
+    "sft": np.array([1, 2, 2, 5, 7]),
+    "blind": np.array([0, 0, 1, 4, 4]),
+    "swapped": np.array([2, 0, 2, 5, 7]),
+    "perceived": np.array([[0, 1], [0, 0], [2, 1], [5, 4], [-1, -1]]),
+}
 
 
 def test_every_answer_is_of_its_cases():
-    cases = answer_cases(QUESTIONS, CONCLUSIONS)
+    cases = answer_cases(QUESTIONS, **CONCLUDED)
     assert [np.flatnonzero(c.rows).tolist() for c in cases] == [[0], [3], [2], [1], [0, 2], [], [1], [0], [1, 4], [4]]
     assert [c.share for c in cases[:4]] == [50, 100, 50, 100 / 3]
 

@@ -3,13 +3,15 @@
 import numpy as np
 import pytest
 
-from experiments.recordings.baselines import constants, logistic, people
 from experiments.recordings.cross_validation import (
     agreement,
     confidence,
+    constants,
     deal_folds,
     joint_log_prob,
+    logistic,
     marginals,
+    people,
     pool,
     scores,
 )
@@ -90,7 +92,7 @@ def videos_of(level: np.ndarray) -> DescribedVideos:
 
 
 def test_logistic_regression_and_people_find_what_determines_the_level(monkeypatch):
-    monkeypatch.setattr("experiments.recordings.baselines.PENALTY", 1.0)
+    monkeypatch.setattr("experiments.recordings.cross_validation.PENALTY", 1.0)
     videos = videos_of(LABEL)
     found = logistic(videos, deal_folds(OBJECTS, LABEL, 4, 0))
     assert (choose(found)[:, :2] == LABEL[:, :2]).mean() > 0.7

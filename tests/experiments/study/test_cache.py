@@ -15,7 +15,8 @@ from rich.console import Console
 from experiments.core.context import Context
 from experiments.core.runs import ROOT
 from experiments.study.cache import LATER, NEVER, USED, fingerprint, source_digest
-from experiments.study.stages import EncodedContacts, StudySFT, make_arm, run_grpo, run_sft
+from experiments.study.seed import StudySeed
+from experiments.study.stages import EncodedContacts, StudySFT, make_arm
 from sensors_io.records import RecordStore
 from tests.experiments import tiny
 from touchr1_jax.training.loop import LoopConfig
@@ -41,10 +42,10 @@ def within(home, name: str, train):
 
 @pytest.fixture(scope="module")
 def sft(policy, data, home):
-    evidence = np.zeros((len(data.store), len(data.clip.sensors), data.label.shape[1], 9), np.float32)
-    order = lambda seed: {"seed": seed, "stage": f"sft/{seed}", "share": True}
+    of = {"config": tiny.STUDY, "data": data, "policy": policy, "share": True}
+    of |= {"evidence": np.zeros((len(data.store), len(data.clip.sensors), data.label.shape[1], 9), np.float32)}
     return lambda name, config=CONFIG, seed=0: within(
-        home, name, lambda context: run_sft(policy, data, evidence, config, context, **order(seed))
+        home, name, lambda context: StudySeed(**of, context=context, seed=seed).run_sft(config, "sft")
     )
 
 
@@ -92,8 +93,9 @@ def grpo(policy, params, data, tmp_path):
         contacts = EncodedContacts(features=features, label=label, truth=label, noise=noise, evidence=evidence)
         loop = LoopConfig(steps=steps, save_every=1)
         arm = make_arm(policy, dict(weights), data.prior(), tiny.STUDY.grpo, loop)
-        order = {"seed": seed, "stage": "grpo/a/0", "share": True}
-        return within(tmp_path, name, lambda context: run_grpo(policy, arm, contacts, params, context, **order))
+        of = {"config": tiny.STUDY, "data": data, "policy": policy, "evidence": evidence, "seed": seed, "share": True}
+        train = lambda context: StudySeed(**of, context=context).run_grpo(arm, "grpo/a", contacts, params)
+        return within(tmp_path, name, train)
 
     return run
 

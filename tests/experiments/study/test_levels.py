@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 
 from experiments.study.examples import SCALE_PX, field_picture
-from experiments.study.levels import LevelAnswers, accuracy_by_agreement, confusion_map, reliability_table
-from experiments.study.sampled import sampled_table
+from experiments.study.levels import (
+    LevelAnswers,
+    accuracy_by_agreement,
+    confusion_map,
+    reliability_table,
+    sampled_table,
+)
 from tests.experiments.study.test_study import TEST, answers_about
 
 WORDS = {"hardness": ("soft", "hard")}

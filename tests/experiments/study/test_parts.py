@@ -12,7 +12,7 @@ from experiments.core.artifacts import read_json
 from experiments.core.context import Context, read_metrics
 from experiments.core.errors import DataError
 from experiments.core.runner import main
-from experiments.study.parts import StudyPart, train_parts
+from experiments.study.study import StudyPart, train_parts
 from sensors_io.units import UnitsError
 
 PARTS = [StudyPart(name=name, seed=seed, first=name == "sft") for name in ("sft", "arm") for seed in (0, 1)]
@@ -40,7 +40,7 @@ def test_each_policy_is_trained_once_those_to_start_from_first(context, tmp_path
 
 def test_a_worker_that_computes_other_bits_is_refused(context, tmp_path, monkeypatch):
     calls = iter(range(100))
-    monkeypatch.setattr("experiments.study.parts.numerics.machine", lambda: {"processor": str(next(calls))})
+    monkeypatch.setattr("experiments.study.study.numerics.machine", lambda: {"processor": str(next(calls))})
     with pytest.raises((DataError, UnitsError), match=r"computes other bits than the driver .*of the driver's kind"):
         train_parts(functools.partial(note, tmp_path), PARTS, {}, True, context)
     assert not list(tmp_path.glob("*-?"))

@@ -8,7 +8,7 @@ import pytest
 
 from experiments.study.scores import PUBLISHED
 from experiments.study.seed import StudySeed
-from experiments.study.stages import ProbeFeatures, StudySFT, answer_feed, gather_evidence, make_arm, run_sft
+from experiments.study.stages import ProbeFeatures, StudySFT, answer_feed, gather_evidence, make_arm
 from experiments.study.study import make_study_arm
 from sensors_io.schema import LEVELS
 from tests.experiments import tiny
@@ -67,7 +67,8 @@ def evidence(data):
 def test_adapters_on_rows_are_trained_beside_a_decoder_that_stands_still(policy, data, evidence, context):
     adapting = with_lora(policy, LoraConfig(rank=2))
     config = StudySFT(steps=3, batch_size=4, pack=WIDTH)
-    found = run_sft(adapting, data, evidence, config, context, seed=0, stage="sft/0")
+    seed = StudySeed(config=tiny.STUDY, data=data, policy=adapting, evidence=evidence, context=context, seed=0)
+    found = seed.run_sft(config, "sft")
     first = policy.init(0, tiny.one_batch(data))
     assert set(found) == {*first, "adapters"}
     jax.tree.map(np.testing.assert_array_equal, found["decoder"], first["decoder"])

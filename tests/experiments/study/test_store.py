@@ -13,7 +13,8 @@ import pytest
 
 from experiments.core.context import Context, read_metrics
 from experiments.study.dataset import open_dataset
-from experiments.study.stages import StudySFT, run_sft
+from experiments.study.seed import StudySeed
+from experiments.study.stages import StudySFT
 from sensors_io import remote
 from sensors_io.__main__ import main as sensors
 from sensors_io.pipeline import ClipConfig
@@ -86,7 +87,8 @@ def train(records, directory, steps: int, cache) -> tuple[list, float]:
     evidence = np.zeros((len(data.store), len(SENSORS), len(ATTRIBUTES), max(LEVELS.values())), np.float32)
     began = time.monotonic()
     with compilations_kept(cache):
-        run_sft(policy, data, evidence, StudySFT(steps=steps, batch_size=4), context, seed=0, stage="sft/0")
+        of = {"config": tiny.STUDY, "data": data, "policy": policy, "evidence": evidence, "context": context, "seed": 0}
+        StudySeed(**of).run_sft(StudySFT(steps=steps, batch_size=4), "sft")
     context.close()
     return read_metrics(directory), time.monotonic() - began
 

@@ -8,8 +8,15 @@ import pytest
 
 from experiments.core.runner import main
 from experiments.study.answers import load_answers, save_answers
-from experiments.study.baselines import baselines, constant_answers, joint_mode, level_answers
-from experiments.study.scores import PUBLISHED, score, score_study
+from experiments.study.scores import (
+    PUBLISHED,
+    baselines,
+    constant_answers,
+    joint_mode,
+    level_answers,
+    score,
+    score_study,
+)
 from experiments.study.stages import ProbeFeatures
 from experiments.study.study import CONTINUED, SFT, Study, check_arms
 from sensors_io.schema import SENSORS
