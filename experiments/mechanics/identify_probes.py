@@ -89,7 +89,7 @@ def points(values: np.ndarray, objects: np.ndarray) -> Interval:
 
 def answers(
     records: Seq[Mapping[str, np.ndarray]], names: Seq[str], data: ContactData, config: ProbeConfig, advance: Advance
-) -> list[Answers]:
+) -> Seq[Answers]:
     """Answers to the properties `names` from each of the records, by probes that are trained on the first of them.
 
     Records are features [n, D] of the same contacts by source; of `SENSORS` all four together are a source too.
