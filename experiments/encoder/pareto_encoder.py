@@ -35,7 +35,6 @@ from experiments.encoder.pretrain import (
     points,
     pretrain,
     probe_encoder,
-    training_rows,
 )
 from experiments.encoder.speed import CompiledProgram, forward, matrix_product, medians, parts
 from experiments.encoder.variants import FRAMES, IMAGE_PX, REFERENCE, EncoderVariant, FieldsOnly, variants
@@ -67,14 +66,10 @@ class ParetoEncoderConfig:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MeasuredVariant:
-    """One variant.
+    """One variant, and the seconds and Gflop of a batch of `TIMED` prompts.
 
-    Args:
-      variant: the encoder.
-      choosing: true where its probes are right about the validation contacts, bool [m, 3].
-      right: the same about the test contacts, bool [n, 3].
-      seconds: of a batch of `TIMED` prompts.
-      gflop: of it.
+    Its probes are right about validation contacts where `choosing`, bool [m, 3], about test contacts where `right`,
+    bool [n, 3].
     """
 
     variant: EncoderVariant
@@ -127,8 +122,8 @@ def learn(
 ) -> tuple[Params, np.ndarray]:
     """The trained encoder, and whether its probes are right about the validation and then the test contacts."""
     store = FieldsOnly(data.store) if variant.fields else data.store
-    rows, stage = training_rows(data), f"dynamics/{name}/{SEED}"
-    state = pretrain(variant.config, store, rows, data.clip, context, stage=stage, seed=SEED)
+    stage = f"dynamics/{name}/{SEED}"
+    state = pretrain(variant.config, store, data.training, data.clip, context, stage=stage, seed=SEED)
     unseen = dataclasses.replace(
         held_out_contacts(data, "test", config.touch),
         store=store,

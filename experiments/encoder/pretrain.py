@@ -5,6 +5,7 @@ The scenes differ from those of the later stages, and are split by object.
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -62,11 +63,6 @@ def open_touch(
     return open_dataset(prepare_records(config, context), clip, 0.5, memory_gib)
 
 
-def training_rows(data: Dataset) -> np.ndarray:
-    """Contacts of all training objects, ascending; all are used, since no later stage shares these scenes."""
-    return data.training
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class HeldOutContacts:
     """Contacts to measure on: probes are fitted on `fit_rows`, everything is measured on `read_rows`.
@@ -97,15 +93,32 @@ class HeldOutContacts:
         return probe_right(np.asarray(contact_features(latent, exists)), label, self.fitted, self.probe)
 
     def encode(self, encode: Encode, context: Context) -> dict[str, np.ndarray]:
-        """Results of all rows on the host, in their order; every call has the same number of contacts."""
-        rows, parts = self.rows, []
-        padded = rows[np.minimum(np.arange(-(-len(rows) // BATCH) * BATCH), len(rows) - 1)]
-        order: dict[str, Any] = {"batch_size": BATCH, "seed": 0, "shuffle": False, "repeat": False}
-        with context.progress("encoding", len(padded)) as advance:
-            for element in clip_batches(self.store, padded, self.clip, **order):
-                parts.append(jax.device_get(encode(touch_batch(element))))
-                advance(BATCH)
-        return {name: np.concatenate([part[name] for part in parts])[: len(rows)] for name in parts[0]}
+        """Results of all rows on the host, in their order."""
+        with context.progress("encoding", len(padded(self.rows, BATCH))) as advance:
+            return read_all(encode, self.store, self.rows, self.clip, advance=advance)
+
+
+def padded(rows: np.ndarray, size: int) -> np.ndarray:
+    """Rows with the last one repeated, so that all batches are whole."""
+    return rows[np.minimum(np.arange(-(-len(rows) // size) * size), len(rows) - 1)]
+
+
+def read_all(
+    read: Callable[[TouchBatch], Any],
+    store: Contacts,
+    rows: np.ndarray,
+    clip: ClipConfig,
+    *,
+    memory: ClipMemory | None = None,
+    advance: Callable[[int], object] = lambda contacts: None,
+) -> Any:
+    """Results of contacts on the host, in their order; every call has `BATCH` of them."""
+    order: dict[str, Any] = {"batch_size": BATCH, "seed": 0, "shuffle": False, "repeat": False, "memory": memory}
+    parts = []
+    for element in clip_batches(store, padded(rows, BATCH), clip, **order):
+        parts.append(jax.device_get(read(touch_batch(element))))
+        advance(BATCH)
+    return jax.tree.map(lambda *x: np.concatenate(x)[: len(rows)], *parts)
 
 
 def held_out_contacts(data: Dataset, part: str, config: StageOneDataConfig, fit: int | None = None) -> HeldOutContacts:
@@ -116,7 +129,7 @@ def held_out_contacts(data: Dataset, part: str, config: StageOneDataConfig, fit:
     return HeldOutContacts(
         store=data.store,
         clip=data.clip,
-        fit_rows=training_rows(data)[: config.probe_fit if fit is None else fit],
+        fit_rows=data.training[: config.probe_fit if fit is None else fit],
         read_rows=data.parts[part],
         label=data.label,
         probe=config.probe,
@@ -232,16 +245,10 @@ def pretrain(
     held_out: HeldOutContacts | None = None,
     memory: ClipMemory | None = None,
 ) -> DynamicsState:
-    """Train encoder and predictor on some contacts, without their labels; a stopped stage resumes.
+    """Train encoder and predictor on the contacts at `rows`, without their labels; a stopped stage resumes.
 
-    Args:
-      config: networks and training.
-      store, rows: the contacts to train on.
-      clip: sensors and flags; number and size of the frames are the config's.
-      context, stage: the run, and the name of the stage, `PHASE/SEED`.
-      seed: of parameters and order.
-      held_out: contacts to measure on every `probe_every` steps; nothing is measured by default.
-      memory: keeps the clips.
+    The clip gives sensors and flags, the config number and size of the frames; `memory` keeps the clips.  Where
+    contacts are `held_out`, it is measured on them every `probe_every` steps.  The stage is named `PHASE/SEED`.
 
     Raises:
       ValueError: contacts to measure on, for another objective than `dynamics`.

@@ -36,7 +36,6 @@ from experiments.encoder.pretrain import (
     open_touch,
     points,
     pretrain,
-    training_rows,
     untrained,
 )
 from sensors_io.scenes.config import SceneConfig
@@ -60,7 +59,7 @@ class PretrainEncoderConfig:
 def run(config: PretrainEncoderConfig, context: Context) -> Results:
     """Train, save the encoder, measure on the test objects before and after."""
     data = open_touch(config.touch, config.pretrain.frames, config.pretrain.image_px, context)
-    rows, sensors = training_rows(data), data.clip.sensors
+    rows, sensors = data.training, data.clip.sensors
     state = pretrain(
         config.pretrain,
         data.store,

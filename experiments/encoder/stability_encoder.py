@@ -29,7 +29,7 @@ from experiments.core.errors import DataError
 from experiments.core.look import PALETTE, SHARED
 from experiments.core.results import Cell, Picture, Results, Table, at_least, at_most, named_table
 from experiments.core.runner import Experiment
-from experiments.encoder.pretrain import StageOneDataConfig, open_touch, training_rows
+from experiments.encoder.pretrain import StageOneDataConfig, open_touch
 from experiments.study.dataset import Dataset
 from sensors_io.pipeline import clip_batches
 from sensors_io.scenes.config import SceneConfig
@@ -96,13 +96,10 @@ class StabilityEncoderConfig:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CollapseOutcome:
-    """One arm.
+    """One arm: the measurements that raise alarms, by name, [seed, block], and two figures at the end, [seed].
 
-    Args:
-      arm: guards and rate.
-      measured: the measurements that raise alarms, by name, [seed, block].
-      kept: [seed], `probes.told_apart` of the test contacts at the end, over that before training.
-      lead: [seed], points of the probes over those on the untrained encoder, at the end.
+    `kept` is the spread between the test contacts over that before training, `lead` the points of the probes over those
+    on the untrained encoder.
     """
 
     arm: CollapseArm
@@ -138,7 +135,7 @@ def run(config: StabilityEncoderConfig, context: Context) -> Results:
     data = open_touch(config.touch, FRAMES, config.touch.scenes.image_px, context)
     if len(data.parts["val"]) < 2:
         raise DataError("part 'val' holds 1 contact: must hold two, or nothing can differ; use more objects")
-    fit, test = training_rows(data), data.parts["test"]
+    fit, test = data.training, data.parts["test"]
     rows = np.concatenate([fit, test])
     label = data.label[rows][:, [ATTRIBUTES.index(name) for name in ORDINAL]]
     train = np.arange(len(rows)) < len(fit)

@@ -38,7 +38,7 @@ from experiments.encoder.pretrain import (
     open_touch,
     points,
     pretrain,
-    training_rows,
+    read_all,
     untrained,
 )
 from experiments.study.dataset import Dataset
@@ -65,8 +65,6 @@ FEW = 30
 
 LEAST_LEAD = 5.0
 """Points over the random encoder that are required there."""
-
-READ_BATCH = 32
 
 CLIP_MEMORY_GIB = 0.5
 """Clips that stay in memory once they were read; all of the default ones."""
@@ -127,7 +125,7 @@ def run(config: StageOneConfig, context: Context) -> Results:
 
 def trained_encoder(config: StageOneConfig, data: Dataset, context: Context, method: str, seed: int) -> Params:
     """Parameters of the encoder after stage 1 by a method; they are written to the run."""
-    rows, clip = training_rows(data), clip_of(config.pretrain, data.clip)
+    rows, clip = data.training, clip_of(config.pretrain, data.clip)
     if method == RANDOM:
         return untrained(config.pretrain, data.store, rows, clip, seed).params["encoder"]
     objective = next(o for o in config.objectives if o == method)
@@ -152,12 +150,12 @@ def fine_tuned_right(
     """Correctness of fine-tuned encoders, [steps, val + test contact, attribute], from the run where it is there."""
 
     def compute() -> list[Any]:
-        rows = labelled_rows(data, count, seed)
+        rows = np.random.default_rng((seed, 31)).permutation(data.training)[:count]  # fewer are always among more
         clip = clip_of(config.pretrain, data.clip)
-        optimizer, step, read = fine_tune_programs(config, len(clip.sensors))
+        tuned, optimizer, step, read = fine_tune_programs(config, len(clip.sensors))
         feed = ClipFeed(data.store, rows, clip, batch_size=config.tune_batch, seed=seed, memory=data.memory)
         one = next(iter(clip_batches(data.store, rows[:1], clip, batch_size=1, seed=0, repeat=False)))
-        state: FineTuneState = start(tuned(config, len(clip.sensors)), optimizer, encoder(), touch_batch(one))
+        state: FineTuneState = start(tuned, optimizer, encoder(), touch_batch(one))
         state, found = jax.device_put(state, jax.devices()[0]), []
         for steps in config.tune_steps:
             loop = LoopConfig(steps=steps, save_every=config.tune_steps[-1])
@@ -168,11 +166,6 @@ def fine_tuned_right(
     return context.once(f"right/{method}-{count}/{seed}", compute)
 
 
-def labelled_rows(data: Dataset, count: int, seed: int) -> np.ndarray:
-    """The labelled contacts of a seed, the same for every method; fewer are always among more."""
-    return np.random.default_rng((seed, 31)).permutation(training_rows(data))[:count]
-
-
 def read_rows(config: StageOneConfig, data: Dataset, part: str) -> np.ndarray:
     """Contacts of a part that are read."""
     return data.parts[part][: config.read if part == "test" else config.read // 2]
@@ -181,25 +174,18 @@ def read_rows(config: StageOneConfig, data: Dataset, part: str) -> np.ndarray:
 def is_right(config: StageOneConfig, data: Dataset, read: Callable[..., Any], params: Params) -> np.ndarray:
     """Correctness of the likeliest level, bool [val + test contact, attribute]."""
     rows = np.concatenate([read_rows(config, data, part) for part in ("val", "test")])
-    padded = rows[np.minimum(np.arange(-(-len(rows) // READ_BATCH) * READ_BATCH), len(rows) - 1)]
-    order: dict[str, Any] = {"batch_size": READ_BATCH, "seed": 0, "shuffle": False, "repeat": False}
-    clips = clip_batches(data.store, padded, clip_of(config.pretrain, data.clip), memory=data.memory, **order)
-    found = [np.asarray(read(params, touch_batch(element))) for element in clips]
-    label = data.label[rows][:, : len(ORDINAL)]
-    return (np.concatenate(found)[: len(rows)] == label) & (label >= 0)
-
-
-def tuned(config: StageOneConfig, sensors: int) -> FineTuned:
-    """The encoder that is fine-tuned."""
-    return FineTuned(encoder=dataclasses.replace(config.pretrain.encoder, sensors=sensors))
+    clip, label = clip_of(config.pretrain, data.clip), data.label[rows][:, : len(ORDINAL)]
+    found = read_all(functools.partial(read, params), data.store, rows, clip, memory=data.memory)
+    return (found == label) & (label >= 0)
 
 
 @functools.cache
-def fine_tune_programs(config: StageOneConfig, sensors: int) -> tuple[Any, Any, Any]:
-    """Optimizer, compiled step, and compiled reading of levels, made once."""
-    made, optimizer = tuned(config, sensors), make_optimizer(config.tune_optimizer, config.tune_steps[-1])
-    levels = jax.jit(lambda params, batch: level_log_probs(made, params, batch).argmax(-1))
-    return optimizer, make_fine_tune_step(made, optimizer), levels
+def fine_tune_programs(config: StageOneConfig, sensors: int) -> tuple[FineTuned, Any, Any, Any]:
+    """The encoder that is fine-tuned, its optimizer, compiled step, and compiled reading of levels, made once."""
+    tuned = FineTuned(encoder=dataclasses.replace(config.pretrain.encoder, sensors=sensors))
+    optimizer = make_optimizer(config.tune_optimizer, config.tune_steps[-1])
+    levels = jax.jit(lambda params, batch: level_log_probs(tuned, params, batch).argmax(-1))
+    return tuned, optimizer, make_fine_tune_step(tuned, optimizer), levels
 
 
 def chosen_steps(right: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ from experiments.core.pictures import image_grid
 from experiments.core.results import Cell, Picture, Results, Table, at_least, named_table
 from experiments.core.runner import Experiment
 from experiments.core.text import bounds, interval
-from experiments.encoder.pretrain import ClipFeed, StageOneDataConfig, open_touch, training_rows
+from experiments.encoder.pretrain import ClipFeed, StageOneDataConfig, open_touch, padded
 from experiments.study import paper_numbers as paper
 from experiments.study.dataset import Dataset
 from sensors_io.arrays import load_arrays
@@ -96,14 +96,11 @@ class VideoPredictionConfig:
 def run(config: VideoPredictionConfig, context: Context) -> Results:
     """Train both predictors, score them and the baselines."""
     data = open_touch(config.touch, config.frames, config.image_px, context)
-    rows, test = training_rows(data), data.parts["test"][: config.scored]
+    rows, test = data.training, data.parts["test"][: config.scored]
     start = None if config.encoder is None else load_encoder(config.encoder)
     predictors = {name: train(config, name, data, rows, context, start) for name in (TOUCH, VISION)}
-    metrics = FrameMetrics(
-        encoder=predictors[TOUCH].config.encoder,
-        params=jax.device_get(predictors[TOUCH].params["encoder"] if start is None else start.params),
-        lpips_weights=None if config.lpips_weights is None else read_lpips(config.lpips_weights),
-    )
+    params = jax.device_get(predictors[TOUCH].params["encoder"] if start is None else start.params)
+    metrics = frame_metrics(predictors[TOUCH].config.encoder, params, config.lpips_weights)
     with context.timed("score"):
         mean = mean_frames(data, rows[: config.mean_of], context)
         methods = FrameMethods(predictors=predictors, mean=mean, skips=config.skips)
@@ -111,18 +108,12 @@ def run(config: VideoPredictionConfig, context: Context) -> Results:
     return report(config, data, scores, data.object_ids[test], frame_grid(methods, data, test))
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class TrainedPredictor:
-    """A trained video predictor."""
+class TrainedPredictor(NamedTuple):
+    """A trained video predictor; `predict` gives frames clipped to [0, 1]."""
 
     config: video.VideoConfig
     params: Params
-
-    @functools.cached_property
-    def predict(self) -> Callable[[TouchBatch, video.Asked], Any]:
-        """Predicted frames, clipped to [0, 1]; compiled once."""
-        apply = jax.jit(lambda p, b, a: jnp.clip(video.predict_frames(self.config, p, b, a), 0.0, 1.0))
-        return functools.partial(apply, self.params)
+    predict: Callable[[TouchBatch, video.Asked], Any]
 
 
 def train(
@@ -151,55 +142,48 @@ def train(
         state = dataclasses.replace(state, params=params)
     step, loop = video.make_video_step(networks, optimizer), LoopConfig(steps=config.film.steps, save_every=100)
     trained = run_loop(step, state, feed, loop, context, f"film/{name.replace(' + ', '-')}/{SEED}")
-    return TrainedPredictor(config=networks, params=trained.params)
+    predict = jax.jit(lambda p, b, a: jnp.clip(video.predict_frames(networks, p, b, a), 0.0, 1.0))
+    return TrainedPredictor(networks, trained.params, functools.partial(predict, trained.params))
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class FrameMetrics:
-    """The metrics: L1, SSIM, LPIPS if its weights are given, and the distance of an encoder's features: of the encoder
-    to start from, if one is given, otherwise of that of the predictor by touch alone."""
+FrameMetrics = Callable[[np.ndarray, np.ndarray, TouchBatch], dict[str, np.ndarray]]
+"""From predicted and true frames [P, S, H, W, 3] in [0, 1] and their batch to metric → [P, S]."""
 
-    encoder: TactileViTConfig
-    params: Params
-    lpips_weights: Mapping[str, np.ndarray] | None
 
-    def score(self, predicted: np.ndarray, target: np.ndarray, batch: TouchBatch) -> dict[str, np.ndarray]:
-        """Metric → [P, S], of frames [P, S, H, W, 3] in [0, 1]."""
+def frame_metrics(encoder: TactileViTConfig, params: Params, lpips_weights: Path | None) -> FrameMetrics:
+    """L1, SSIM, distance of an encoder's features, and LPIPS by weights of the published shapes, if given.
+
+    The distance is the mean |LN f(x̂) − LN f(x)| over the patch tokens of the second frame of the pair (first frame,
+    frame).
+    """
+    network = TactileViT(encoder)
+
+    def tokens(params: Params, frame: Any, batch: TouchBatch) -> Any:
+        pair = 255.0 * jnp.stack([video.unit_pixels(batch.frames[:, :, 0]), frame], 2)
+        index = jnp.broadcast_to(jnp.arange(2), pair.shape[:3])
+        sensors = jnp.broadcast_to(jnp.arange(pair.shape[1]), pair.shape[:2])
+        streams = (pair, jnp.zeros((*index.shape, 3)), index, jnp.ones(index.shape, bool), sensors)
+        encoded: Any = network.apply({"params": params}, *streams, method=TactileViT.encode)
+        return layer_norm(encoded.patches[:, :, 1])
+
+    distance = jax.jit(lambda p, a, b, batch: jnp.abs(tokens(p, a, batch) - tokens(p, b, batch)).mean((-2, -1)))
+    weights = {} if lpips_weights is None else load_arrays(lpips_weights)
+    if weights:
+        check_weights(weights)
+    perceptual = jax.jit(lambda a, b: lpips(a, b, weights))
+
+    def score(predicted: np.ndarray, target: np.ndarray, batch: TouchBatch) -> dict[str, np.ndarray]:
         found = {
             "l1": np.abs(predicted - target).mean((-3, -2, -1)),
             "ssim": ssim(predicted, target),
-            "encoder_distance": np.asarray(self._distance(self.params, predicted, target, batch)),
+            "encoder_distance": np.asarray(distance(params, predicted, target, batch)),
         }
-        if self.lpips_weights is not None:
+        if weights:
             flat = lambda x: jnp.asarray(x).reshape(-1, *x.shape[-3:])
-            found["lpips"] = np.asarray(self._lpips(flat(predicted), flat(target))).reshape(predicted.shape[:2])
+            found["lpips"] = np.asarray(perceptual(flat(predicted), flat(target))).reshape(predicted.shape[:2])
         return found
 
-    @functools.cached_property
-    def _lpips(self) -> Callable[..., Any]:
-        return jax.jit(lambda a, b: lpips(a, b, self.lpips_weights or {}))
-
-    @functools.cached_property
-    def _distance(self) -> Callable[..., Any]:
-        """Mean |LN f(x̂) − LN f(x)| over the patch tokens of the second frame of the pair (first frame, frame)."""
-        network = TactileViT(self.encoder)
-
-        def tokens(params: Params, frame: Any, batch: TouchBatch) -> Any:
-            pair = 255.0 * jnp.stack([video.unit_pixels(batch.frames[:, :, 0]), frame], 2)
-            index = jnp.broadcast_to(jnp.arange(2), pair.shape[:3])
-            sensors = jnp.broadcast_to(jnp.arange(pair.shape[1]), pair.shape[:2])
-            streams = (pair, jnp.zeros((*index.shape, 3)), index, jnp.ones(index.shape, bool), sensors)
-            encoded: Any = network.apply({"params": params}, *streams, method=TactileViT.encode)
-            return layer_norm(encoded.patches[:, :, 1])
-
-        return jax.jit(lambda p, a, b, batch: jnp.abs(tokens(p, a, batch) - tokens(p, b, batch)).mean((-2, -1)))
-
-
-def read_lpips(path: Path) -> dict[str, np.ndarray]:
-    """The weights of LPIPS, whose shapes must be the published ones."""
-    weights = load_arrays(path)
-    check_weights(weights)
-    return weights
+    return score
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -262,7 +246,7 @@ def score_frames(
         for batch, count in batches(data, rows):
             frames = [methods.frames(batch, t, k) for t, k in questions]
             for name, parts in blocks.items():
-                found = [(metrics.score(one[name], one[TARGET], batch), one[EXISTS]) for one in frames]
+                found = [(metrics(one[name], one[TARGET], batch), one[EXISTS]) for one in frames]
                 known = {m: [np.where(exists, s[m], np.nan) for s, exists in found] for m in found[0][0]}
                 parts.append({m: np.stack(values, -1)[:count] for m, values in known.items()})
             advance(count)
@@ -275,9 +259,9 @@ def score_frames(
 
 def batches(data: Dataset, rows: np.ndarray) -> Iterator[tuple[TouchBatch, int]]:
     """Batches of one size, the last one padded, and the number of their contacts that count."""
-    padded = rows[np.minimum(np.arange(-(-len(rows) // SCORE_BATCH) * SCORE_BATCH), len(rows) - 1)]
-    clips = data.batches(padded, batch_size=SCORE_BATCH, seed=0, shuffle=False, repeat=False)
-    for start, clip in zip(range(0, len(padded), SCORE_BATCH), clips, strict=True):
+    whole = padded(rows, SCORE_BATCH)
+    clips = data.batches(whole, batch_size=SCORE_BATCH, seed=0, shuffle=False, repeat=False)
+    for start, clip in zip(range(0, len(whole), SCORE_BATCH), clips, strict=True):
         yield touch_batch(clip), min(SCORE_BATCH, len(rows) - start)
 
 

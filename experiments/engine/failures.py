@@ -29,18 +29,10 @@ Knob = Callable[[GrpoVariant, float], Setting]  # (variant, value) → setting o
 
 @dataclasses.dataclass(frozen=True)
 class FailureScenario:
-    """A failure, the knob that drives it, and the criterion of a failed seed.
+    """A failure with the code of its alarm, the knob that drives it, and the criterion of a failed seed.
 
-    Attributes:
-      code: that of its alarm.
-      title: what fails.
-      knob: meaning of `values`.
-      values: of the knob, from the mildest on.
-      criterion: `failed` in words.
-      failing: variant that is compared with the `stable` preset.
-      setting: applies the knob.
-      failed: run → whether each seed has failed.
-      others: codes of other alarms that notice the same failure.
+    The knob has values from the mildest on, which `setting` applies; the criterion says `failed` in words.  The variant
+    `failing` is compared with the `stable` preset; `others` are codes of other alarms that notice the same failure.
     """
 
     code: str

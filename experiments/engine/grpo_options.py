@@ -71,14 +71,10 @@ NAMES = tuple(variant.name for family in OPTIONS.values() for variant in family)
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class OptionRun:
-    """All seeds of one option.
+    """All seeds of one option: accuracy, entropy and KL to the policy before training, after it, nat a token, [seeds].
 
-    Args:
-      accuracy: of sampled answers after training, [seeds].
-      entropy: of the policy after training, nat a token, [seeds].
-      kl: to the policy before training, nat a token, [seeds].
-      right: accuracy of the rollouts of every step, of dynamic sampling those of all candidates, [seeds, steps].
-      step_s: seconds of one step of all seeds.
+    Also accuracy of the rollouts of every step, of all candidates in dynamic sampling, [seeds, steps], and seconds of
+    one step of all seeds.
     """
 
     accuracy: np.ndarray

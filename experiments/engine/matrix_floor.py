@@ -61,12 +61,8 @@ class TimedProduct(NamedTuple):
 def equations(jaxpr: Jaxpr, loops: int | None = None) -> Iterator[tuple[Any, int]]:
     """Every product and convolution of a program and how often it is computed; of a choice those of the longest branch.
 
-    Args:
-      jaxpr: the program.
-      loops: rounds of each `while` loop; a `scan` knows its own.
-
     Raises:
-      ValueError: a product within a `while` loop, whose rounds are not given.
+      ValueError: a product within a `while` loop, whose rounds `loops` does not give; a `scan` knows its own.
     """
     for eqn in jaxpr.eqns:
         name, params = eqn.primitive.name, eqn.params

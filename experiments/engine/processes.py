@@ -15,10 +15,7 @@ T = TypeVar("T")
 def in_own_process(work: Callable[..., T], *arguments: Any, progress: ProgressCallback | None = None) -> T:
     """The result of a function of a module, called in a fresh interpreter, whose peak memory is then the work's.
 
-    Args:
-      work: the function; if there is a progress callback it takes one too, as `progress`.
-      arguments: all of its others.
-      progress: called in this process with the progress of that one.
+    A `progress` callback is called in this process; the function then takes one too, under that name.
 
     Raises:
       BrokenProcessPool: the process ended without an answer, as one that the system stops for its memory does.

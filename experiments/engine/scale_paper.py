@@ -17,6 +17,7 @@ sampling gathers the sharded weights once, not at every token.
 """
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 
 from experiments.core.charts import Panel, Rule, Series, draw
@@ -87,11 +88,6 @@ class ScaleConfig:
         model, prompt = (TINY, TINY_PROMPT) if self.size == "tiny" else (released(self.size), PAPER_PROMPT)
         return Training(model=model, prompt=prompt, group=self.group, length=self.length, prompts=self.prompts)
 
-    @property
-    def depth(self) -> int:
-        """Layers of the model."""
-        return self.training.model.decoder.num_layers
-
 
 def run(config: ScaleConfig, context: Context) -> Results:
     """Count every setup, compile the first, predict."""
@@ -128,11 +124,9 @@ def run(config: ScaleConfig, context: Context) -> Results:
 def compiled(config: ScaleConfig, setup: Setup, context: Context) -> Compiled:
     """Bytes that the compiler reserves, saved as a stage."""
     stage = f"compile/{config.setups.index(setup)}"
-    if not context.done(stage):
-        with context.timed(stage):
-            reserved = compile_in_process(config.training, setup, config.compiler)
-        context.save_stage(stage, reserved)
-    found = Compiled(*context.load_stage(stage))
+    with context.timed(stage):
+        work = functools.partial(compile_in_process, config.training, setup, config.compiler)
+        found = Compiled(*context.once(stage, work))
     context.print(f"{setup.name}: {found.peak / GB:.2f} GB")
     return found
 
@@ -181,20 +175,19 @@ def byte_table(lines: Lines) -> Table:
 
 def memory_table(config: ScaleConfig, lines: Lines, reserved: Reserved) -> Table:
     """The compiler's figures with the count."""
-    rows: list[dict[str, Cell]] = []
-    for setup, c in reserved.items():
-        rows.append(
+    layers = config.training.model.decoder.num_layers
+    return named_table(
+        f"Reserved by XLA's compiler for {config.compiler}, GB on each device",
+        [
             {
-                "setup": f"{setup.name}, {config.depth} layers",
+                "setup": f"{setup.name}, {layers} layers",
                 "arguments": c.arguments / GB,
                 "temporary": c.temporary / GB,
                 "peak": c.peak / GB,
                 "counted": counted_peak(lines[setup]) / GB,
             }
-        )
-    return named_table(
-        f"Reserved by XLA's compiler for {config.compiler}, GB on each device",
-        rows,
+            for setup, c in reserved.items()
+        ],
         formats=dict.fromkeys(("arguments", "temporary", "peak", "counted"), ".2f"),
         note="On `cpu` the compiler multiplies bfloat16 as float32, layer by layer: an upper bound.",
     )

@@ -42,7 +42,7 @@ from touchr1_jax.rl.counterfactual import noise_touch, shuffle_touch, swap_touch
 from touchr1_jax.rl.grpo import FrozenInputs, make_grpo_step, start_state
 from touchr1_jax.rl.losses import entropy, exact_kl, token_log_probs
 from touchr1_jax.rl.metrics import answer_metrics
-from touchr1_jax.rl.rollout import SampleConfig, encode_prompts, sample_prompts
+from touchr1_jax.rl.rollout import GRPOBatch, SampleConfig, encode_prompts, sample_prompts
 from touchr1_jax.rl.scoring import ScoreFn, make_score, reward_weights
 from touchr1_jax.rl.stream_check import check_streams
 from touchr1_jax.training.optimizer import falling_adamw
@@ -205,11 +205,7 @@ def pretrain(budget: TrainingBudget, world: World, key: Array) -> Params:
     optimizer = optax.adam(optax.cosine_decay_schedule(PRETRAIN_RATE, budget.pretrain_steps))
 
     def loss(params: Params, scene: WorldBatch, tokens: Int[Array, "P T"], counts: Array) -> Array:
-        batch = scene.batch
-        logits = jax.vmap(FNS.group_logits, in_axes=(None, 0, 0, 0, 0))(
-            params, batch.features, batch.ids, batch.mask, tokens[:, None]
-        )
-        return -masked.mean(token_log_probs(jax.nn.log_softmax(logits[:, 0]), tokens), counts)
+        return -masked.mean(token_log_probs(log_probs(params, scene.batch, tokens[:, None])[:, 0], tokens), counts)
 
     def step(carry: tuple[Params, optax.OptState], t: Array):
         params, opt_state = carry
@@ -223,6 +219,12 @@ def pretrain(budget: TrainingBudget, world: World, key: Array) -> Params:
     params = jax.tree.map(jnp.asarray, untrained)
     (params, _), _ = jax.lax.scan(step, (params, optimizer.init(params)), jnp.arange(budget.pretrain_steps))
     return params
+
+
+def log_probs(params: Params, batch: GRPOBatch, tokens: Int[Array, "P G T"]) -> Float[Array, "P G T V"]:
+    """Log-probabilities at every token of G answers to each question."""
+    logits = jax.vmap(FNS.group_logits, in_axes=(None, 0, 0, 0, 0))
+    return jax.nn.log_softmax(logits(params, batch.features, batch.ids, batch.mask, tokens))
 
 
 def reinforce(
@@ -342,10 +344,7 @@ def divergences(
 
     def log_p(which: Params, touch: Float[Array, "P S N D"]) -> Array:
         batch = dataclasses.replace(scene.batch, features=dataclasses.replace(features, touch=touch))
-        logits = jax.vmap(FNS.group_logits, in_axes=(None, 0, 0, 0, 0))(
-            which, batch.features, batch.ids, batch.mask, rollout.tokens
-        )
-        return jax.nn.log_softmax(logits)
+        return log_probs(which, batch, rollout.tokens)
 
     own = log_p(params, features.touch)
     mean = lambda x: jnp.mean(masked.mean(x, rollout.mask, axis=-1))

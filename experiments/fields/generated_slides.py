@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.mechanics import tangential_scenes as scenes
+from experiments.mechanics.tangential_methods import dragged
 from sensors_io.fields.inversion import NodeGrid
 from sensors_io.scenes import drag
 from sensors_io.scenes.sensors import SensorModel
-from sensors_io.scenes.traction import in_series, resultant, shear_displacement
+from sensors_io.scenes.traction import shear_displacement
 
 NODES = 20  # rows and columns of the measured fields, as in the records of generated scenes
 _PER_NODE = 4  # contact pixels along a node's side
@@ -22,14 +23,10 @@ _LEAST_FORCE_N = 0.5  # frames that press less have hardly any shear
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Slide:
-    """One sequence of F frames on the node grid [F, h, w, …], measured and true.
+    """One sequence of F frames on the node grid [F, h, w, …].
 
-    Args:
-      motion: of the contact.
-      deformation_mm, depth_mm, valid: measured in the marker plane, with the sensor's noise and lost nodes.
-      shear_mm: true, the part of the displacement that traction causes.
-      traction_mpa: true, on the gel, (x, y, z).
-      force_n, moment_nmm: true, [F, 3].
+    Deformation, depth and validity are measured in the marker plane, with the sensor's noise and lost nodes; the shear,
+    which is the displacement that traction causes, the traction (x, y, z), force and moment [F, 3] are true.
     """
 
     motion: str
@@ -63,15 +60,7 @@ def node_grid(sensor: SensorModel) -> NodeGrid:
 def make_slides(
     sensor: SensorModel, kinds: tuple[str, ...], motions: tuple[str, ...], frames: int, seed: int
 ) -> list[Slide]:
-    """Every motion by one object of every kind.
-
-    Args:
-      sensor: a model with markers.
-      kinds: of `experiments.mechanics.tangential_scenes.KINDS`.
-      motions: names of the protocol's.
-      frames: of a sequence.
-      seed: of objects and noise.
-    """
+    """Every motion of the protocol by one object of every kind (`tangential_scenes.KINDS`), on a gel with markers."""
     kernels = scenes.friction_kernels(sensor, NODES * _PER_NODE)
     noise_mm = np.array([sensor.lateral_noise_mm, sensor.lateral_noise_mm, sensor.depth_noise_mm])
     made = []
@@ -101,26 +90,19 @@ cached_slides = functools.lru_cache(maxsize=8)(make_slides)
 @jax.jit
 def _solve(kernels: scenes.FrictionKernels, motion: scenes.FrictionSequence) -> dict[str, jax.Array]:
     """Displacement [F, 3, N, N], its part by traction, load and resultants of every frame."""
-    series = in_series(kernels.gel, kernels.body, 1.0, motion.modulus_mpa)
-    bodies = drag.Bodies(compliance=series, coupling=None, response=kernels.markers)
 
-    def advance(
-        history: drag.History, at: tuple[jax.Array, drag.RigidMotion]
-    ) -> tuple[drag.History, dict[str, jax.Array]]:
-        pressure, step = at
-        history, frame = drag.advance(history, pressure, motion.friction, step, bodies, kernels.x_mm)
-        traction = frame.traction_mpa
-        force, moment = resultant(pressure, traction, kernels.x_mm, kernels.spacing_mm)
-        sheared = shear_displacement(traction, kernels.markers.shear)
-        return history, {
+    def keep(frame: drag.Frame) -> dict[str, jax.Array]:
+        traction, sheared = frame.traction_mpa, shear_displacement(frame.traction_mpa, kernels.markers.shear)
+        return {
             "displacement": frame.displacement_mm,
             "shear": jnp.stack([sheared.real, sheared.imag]),
-            "load": jnp.stack([traction.real, traction.imag, -pressure]),
-            "force": force,
-            "moment": moment,
+            "traction": jnp.stack([traction.real, traction.imag]),
+            "force": frame.force_n,
+            "moment": frame.moment_nmm,
         }
 
-    return jax.lax.scan(advance, drag.at_rest(kernels.x_mm.shape[0]), (motion.pressure_mpa, motion.step))[1]
+    found = dragged(motion, kernels, keep)
+    return found | {"load": jnp.concatenate([found["traction"], -motion.pressure_mpa[:, None]], 1)}
 
 
 def _node_means(fields: np.ndarray) -> np.ndarray:

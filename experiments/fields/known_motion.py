@@ -55,12 +55,8 @@ class GelMotion:
 
         b(y) = s [ (c₀ + c₁ξ + c₂η) g + k₀,  (c₃ + c₄ξ + c₅η) g + k₁ ],  g = exp(−(ξ² + η²)/2)
 
-    Args:
-      centre_px: of the contact; ξ and η are the distances from it over `width_px`.
-      width_px: of the contact.
-      bump: c₀…c₅.
-      drift: k₀, k₁: motion of the whole gel.
-      scale_px: s.
+    with the distances ξ and η from `centre_px` over `width_px`, the `bump` c, the `drift` k of the whole gel and the
+    scale s.
     """
 
     centre_px: tuple[float, float]
@@ -91,12 +87,9 @@ class GelMotion:
 
 
 def pressed(shape: tuple[int, ...], peak_px: float, rng: np.random.Generator | None = None) -> GelMotion:
-    """A motion of greatest displacement `peak_px`.
+    """A motion whose greatest |b| over a picture of this shape is `peak_px`.
 
-    Args:
-      shape: of the picture.
-      peak_px: greatest |b| over the picture.
-      rng: draws place, width and coefficients; `None` takes those of the published figures.
+    Place, width and coefficients are drawn, without `rng` those of the published figures.
     """
     height, width = shape[:2]
     drawn: Sequence[float] = (0.7, 0.25, -0.25, 0.4, 0.25, 0.25, 0.1, -0.05)
@@ -116,13 +109,7 @@ def pressed(shape: tuple[int, ...], peak_px: float, rng: np.random.Generator | N
 
 
 class GelCamera:
-    """Pictures of one gel under known motion.
-
-    Args:
-      rest: RGB uint8 [H, W, 3].
-      noise_grey: standard deviation of the camera's noise.
-      seed: of the noise.
-    """
+    """Pictures of one gel under known motion; `rest` is RGB uint8 [H, W, 3], `noise_grey` the noise's deviation."""
 
     def __init__(self, rest: np.ndarray, noise_grey: float, seed: int):
         self._splines = [spline_filter(rest[..., c].astype(np.float64), order=3) for c in range(3)]
@@ -156,15 +143,9 @@ class GelCamera:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MarkerGel:
-    """A gel at rest as the package tracks it.
+    """A gel at rest, RGB uint8 [H, W, 3], as the package tracks it: points [P, 2], half side of their windows.
 
-    Args:
-      name: of the gel.
-      picture: RGB uint8 [H, W, 3], at rest.
-      real: a camera took it.
-      points_px: tracked points [P, 2].
-      half_px: half side of their windows.
-      dot_radius_px: radius of a dot; on a dense pattern, half the side of a window.
+    On a dense pattern half the side of a window stands for the radius of a dot.
     """
 
     name: str

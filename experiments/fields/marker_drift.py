@@ -81,9 +81,8 @@ def bound_px(gel: MarkerGel, light_and_strain: bool) -> float:
 
         Cov d ≥ 2σ² [(Σ_r J_r J_rᵀ)⁻¹]_dd,   J = (∇I, and with unknown light and strain: ∇I ⊗ r, 1, r, I)
 
-    Args:
-      gel: sums run over the windows that the package takes.
-      light_and_strain: strain, brightness, its slope and contrast of the window are unknown too.
+    Sums run over the windows that the package takes; with `light_and_strain` their strain, brightness, its slope and
+    contrast are unknown too.
 
     Source: Kay, Fundamentals of Statistical Signal Processing I, 1993, ch. 3.
     """

@@ -24,8 +24,13 @@ from collections.abc import Callable
 from experiments.core.context import Context
 from experiments.core.results import Results
 from experiments.core.runner import Experiment
-from experiments.fields.depth_accuracy import generated_sections, recorded_sections
-from experiments.fields.depth_checks import contact_section, integrator_section, known_depth_section
+from experiments.fields.depth_accuracy import (
+    contact_section,
+    generated_sections,
+    integrator_section,
+    known_depth_section,
+    recorded_sections,
+)
 from experiments.fields.false_alarms import pattern_section
 from experiments.fields.known_motion import gels
 from experiments.fields.marker_drift import drift_section

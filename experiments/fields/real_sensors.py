@@ -143,13 +143,9 @@ def _calibrated(
 
 
 def field_rows(fields: Fields, chosen: np.ndarray, names: Sequence[str], changes: np.ndarray) -> bytes:
-    """A PNG of one row a picture: change of colour, depth with the outline of the contact, its profile, deformation.
+    """A PNG of one row a chosen picture: `changes` of colour, depth, its profile, deformation.
 
-    Args:
-      fields: of all pictures.
-      chosen: the pictures to draw.
-      names: of these.
-      changes: uint8 [n, H, W, 3], their change of colour, grey where there is none.
+    `fields` are those of all pictures; `names` and `changes`, uint8 [n, H, W, 3], of the chosen ones alone.
     """
     with mpl.rc_context(LOOK):
         figure = Figure(figsize=(11, 2.2 * len(chosen) + 0.3), dpi=110, layout="constrained")

@@ -18,12 +18,10 @@ OURS = "this"  # the package's method
 
 
 class StressOutcome(NamedTuple):
-    """One frame read by one method under one level of one stress.
+    """One frame read by one method under one level of one stress, and the flags that warn of it.
 
-    Args:
-      error: summary of the distance from the truth, in the unit of the chart; infinite where the method gives nothing.
-      wrong: share of the frame that is given and wrong.
-      flags: those that warn of the frame.
+    The error is in the unit of the chart, infinite where the method gives nothing; `wrong` is the share of the frame
+    that is given and wrong.
     """
 
     error: float
@@ -59,15 +57,10 @@ def silent_frames(by_level: Mapping[tuple[str, float], Sequence[StressOutcome]])
 
 
 class StressedField(NamedTuple):
-    """A field under stress.
+    """A field under stresses: name with the unit → levels, mild to severe; one panel of the chart each.
 
-    Args:
-      name: `tracking`, `shear` or `depth`.
-      stresses: name with the unit → levels, mild to severe; one panel of the chart each.
-      tolerance: error from which a reading is wrong.
-      unit: of the errors.
-      caption: of the chart.
-      failures: name of the readings and of their fault, where `OURS` must have no fault without a flag.
+    A reading is wrong from an error of `tolerance` on; `failures` name the readings and their fault, where `OURS` must
+    have no fault without a flag.
     """
 
     name: str

@@ -200,14 +200,7 @@ def _assumed_sensor(kind: str, level: float) -> SensorModel:
 
 
 def attempt_depth(presses: int, seeds: int, seed: int, context: Context) -> Iterator[Attempt]:
-    """All methods under all stresses on generated presses.
-
-    Args:
-      presses: that the calibration is made with.
-      seeds: presses under each level.
-      seed: of the calibration's presses; places and noise follow it.
-      context: shows progress.
-    """
+    """All methods under all stresses: `seeds` presses under each level, by a calibration made with `presses`."""
     methods = _depth_methods(presses, seed)
     for (stress, level), i in context.each("depth", itertools.product(DEPTH.levels, range(seeds))):
         picture, truth, inside = _press_picture(stressed_press(stress, level, seed + i), seed + 1 + i)
@@ -216,13 +209,7 @@ def attempt_depth(presses: int, seeds: int, seed: int, context: Context) -> Iter
 
 
 def depth_outcome(depth: np.ndarray, flags: Flag, truth: np.ndarray, inside: np.ndarray) -> StressOutcome:
-    """Root mean square error over the contact as a share of the press depth.
-
-    Args:
-      depth, truth: [H, W], in the same unit.
-      flags: of the reading.
-      inside: bool [H, W], pixels of the contact.
-    """
+    """Root mean square error of depth [H, W] inside the contact, bool [H, W], as a share of the press depth."""
     off = float(np.sqrt(np.mean((depth - truth)[inside] ** 2)) / truth.max())
     return StressOutcome(off, float(off > DEPTH.tolerance), flags)
 

@@ -35,11 +35,7 @@ _MARGIN = 0.1  # of height and width: within, the markers surround every pixel
 def marker_errors(gel: MarkerGel, peak_px: float, steps: int, noise_seed: int | None) -> dict[str, list[np.ndarray]]:
     """Distance of every point from the truth at the end of every motion, by method, px; infinite if reported lost.
 
-    Args:
-      gel: the gel.
-      peak_px: greatest displacement.
-      steps: pictures in which a motion is made, for methods that go from frame to frame.
-      noise_seed: of the camera; `None` takes that of the motion.
+    A motion is made in `steps` pictures; without a `noise_seed` the camera's noise has the seed of the motion.
     """
     found: dict[str, list[np.ndarray]] = {name: [] for name in FOLLOWERS}
     for seed in SEEDS:

@@ -64,10 +64,7 @@ def blur(gap: Array, force: Array, gel: Array, total: Array, spacing: float) -> 
 def spg_plain(tolerance: float, published: bool) -> ContactSolver:
     """Projected Barzilai–Borwein steps from a bed of springs, on the finest grid only, without preconditioner.
 
-    Args:
-      tolerance: to stop at.
-      published: stop on (Σ p|g| / Σ p + 0.1 penetration) / δ, else on the residual of the package's solver, which is
-        stricter.
+    The `published` stop is on (Σ p|g| / Σ p + 0.1 penetration) / δ; the residual of the package's solver is stricter.
 
     Source: Birgin, Martínez & Raydan 2000, without line search.
     """

@@ -145,14 +145,7 @@ def contact_mechanics_pressure(gap_mm: np.ndarray, force_n: float, tolerance: fl
 
 
 class PublishedSolver(NamedTuple):
-    """A published solver.
-
-    Attributes:
-      name: in the tables.
-      package: to import.
-      solve: gap [N, N] mm, force N and tolerance → pressure [N, N] MPa and seconds.
-      tight: tolerance at which it serves as an oracle.
-    """
+    """A published solver: gap [N, N] mm, force N, tolerance → pressure [N, N] MPa, seconds; an oracle if `tight`."""
 
     name: str
     package: str

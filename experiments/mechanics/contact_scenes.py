@@ -112,10 +112,7 @@ def exact(scenes: Iterable[tuple[np.ndarray, ...]], kernels: GelKernels) -> np.n
 def batch_solver(solve: Callable[..., Any], scenes: ContactScenes, kernels: GelKernels) -> Callable[[], Any]:
     """A compiled call that solves all scenes one after the other and stacks the results.
 
-    Args:
-      solve: maps gap [N, N] mm, force N, compliance of the gel and of the object [M, M//2 + 1] mm/MPa to arrays.
-      scenes: gaps, forces and moduli.
-      kernels: of the gel and of an object of 1 MPa.
+    `solve` maps gap [N, N] mm, force N, compliance of the gel and of the object [M, M//2 + 1] mm/MPa to arrays.
     """
     gel, body = jnp.asarray(kernels.gel, jnp.float32), jnp.asarray(kernels.body, jnp.float32)
     inputs = jax.tree.map(jnp.asarray, scenes)
@@ -159,10 +156,7 @@ def rough_sphere(rng: np.random.Generator, grid: int) -> np.ndarray:
 def failure_suite(grid: int) -> tuple[FailureCase, ...]:
     """Scenes at which contact solvers are known to fail: overflow, cycling, empty contacts, broken assumptions.
 
-    Kernel overflow is that of sinh(qh) in float32, at qh > 88: the finest wave of a thick gel.
-
-    Args:
-      grid: side of the grid, a multiple of 4.
+    Kernel overflow is that of sinh(qh) in float32, at qh > 88: the finest wave of a thick gel.  4 divides the grid.
     """
     x, half = pixel_centres(grid), grid // 2
     r2 = x[None] ** 2 + x[:, None] ** 2

@@ -16,6 +16,7 @@ point, 24² several, a bed of springs ten.
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence as Seq
 
 import numpy as np
@@ -24,12 +25,11 @@ from experiments.core.context import Context
 from experiments.core.results import Requirement, Results, at_least, at_most
 from experiments.core.runner import Experiment
 from experiments.mechanics import identify_motions
-from experiments.mechanics import identify_probes as probes
 from experiments.mechanics import identify_report as report
 from experiments.mechanics.identify_features import ContactData
 from experiments.mechanics.identify_motions import MOTIONS, MotionData
 from experiments.mechanics.identify_presses import ContactTier, PressData, press
-from experiments.mechanics.identify_probes import DYNAMIC, FORCE, FUSED, SHAPE, STATIC
+from experiments.mechanics.identify_probes import DYNAMIC, FORCE, FUSED, SHAPE, STATIC, answers
 from experiments.mechanics.identify_report import CHANCE, MAY_LOSE, StudyPredictions
 from sensors_io.live import LiveScenes
 from sensors_io.scenes.config import SceneConfig, require
@@ -118,19 +118,22 @@ def _predict(
     dynamic: dict[str, tuple[Seq[np.ndarray], ContactData]] = {"press": (at_rest, pressed)}
     dynamic |= {motion: (m.touch, m) for motion, m in moved.items()}
     per_sensor = len(STATIC) * (len(config.noise) + len(tiers)) + len(DYNAMIC) * len(dynamic)
-    blind = 2 * (len(STATIC) + len(DYNAMIC) * len(dynamic))
-    fit = config.probe
-    with context.progress("probes", len(SENSORS) * per_sensor + blind) as advance:
+    without = 2 * (len(STATIC) + len(DYNAMIC) * len(dynamic))
+    touched = lambda tier, level: {s: pressed.features(tier, order, level) for order, s in enumerate(SENSORS)}
+    blind = lambda data: {SHAPE: data.shape, FORCE: data.force.reshape(len(data.force), -1)}
+    with context.progress("probes", len(SENSORS) * per_sensor + without) as advance:
+        ask = functools.partial(answers, config=config.probe, advance=advance)
+        exact = [touched(config.exact, level) for level in range(len(config.noise))]
         return StudyPredictions(
             noise=config.noise,
             exact=config.exact.name,
             solved=tuple(tier.name for tier in config.solved),
             springs=config.springs.name,
-            touch=probes.over_noise(pressed, config.exact, len(config.noise), fit, advance),
-            blind=probes.without_touch(pressed, STATIC, fit, advance),
-            tiers=probes.from_tiers(pressed, tiers, config.exact, own, fit, advance),
-            motion={name: probes.by_motion(touch, m, fit, advance) for name, (touch, m) in dynamic.items()},
-            still={name: probes.without_touch(m, DYNAMIC, fit, advance) for name, (_, m) in dynamic.items()},
+            touch=[ask([records], STATIC, pressed)[0] for records in exact],
+            blind=ask([blind(pressed)], STATIC, pressed)[0],
+            tiers={tier.name: ask([touched(tier, 0), exact[own]], STATIC, pressed) for tier in tiers},
+            motion={n: ask([dict(zip(SENSORS, t, strict=True))], DYNAMIC, m)[0] for n, (t, m) in dynamic.items()},
+            still={name: ask([blind(m)], DYNAMIC, m)[0] for name, (_, m) in dynamic.items()},
             pressed=pressed,
             moved=moved,
         )

@@ -30,14 +30,9 @@ class MotionData(ContactData):
 def motion_data(
     config: SceneConfig, motion: str, moments: int, advance: Callable[[], object], rows: list[int] | None = None
 ) -> MotionData:
-    """Make and summarise contacts of one motion.
+    """Make and summarise contacts of one of `MOTIONS`, all of the protocol's or those at `rows`.
 
-    Args:
-      config: the protocol.
-      motion: one of `MOTIONS`.
-      moments: frames of a sequence that are used.
-      advance: called after each contact.
-      rows: indices of the contacts; all of the motion by default.
+    Of each sequence `moments` frames are used; `advance` is called after each contact.
     """
     scenes = LiveScenes(config)
     rows = contacts_of(scenes, motion) if rows is None else rows
@@ -66,14 +61,10 @@ def contacts_of(scenes: LiveScenes, motion: str) -> list[int]:
 
 
 def choose_frames(phase: np.ndarray, moments: int) -> np.ndarray:
-    """The untouched first frame, then frames spread evenly over those in which something changes.
-
-    Args:
-      phase: `Phase` of every frame [F].
-      moments: number of frames.
+    """The untouched first frame, then frames spread evenly over those whose `Phase` [F] is one of change.
 
     Raises:
-      ValueError: fewer frames than that.
+      ValueError: fewer than `moments` frames.
     """
     busy = np.flatnonzero(~np.isin(phase, (Phase.APPROACH, Phase.HOLD)))
     if moments - 1 > len(busy):

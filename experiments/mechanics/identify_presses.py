@@ -92,13 +92,9 @@ class PressData(ContactData):
 def press(
     config: SceneConfig, tiers: Seq[tuple[ContactTier, tuple[float, ...]]], batch: int, advance: Callable[[], object]
 ) -> PressData:
-    """Make every press at every tier.
+    """Make every press at every tier with its multiples of noise; the first tier's skin is the true shape.
 
-    Args:
-      config: scenes without `sequences`.
-      tiers: tiers, each with its multiples of noise; the first one's skin is the true shape.
-      batch: presses in one call of a compiled program.
-      advance: called after each tier of each sensor.
+    The config has no `sequences`; `advance` is called after each tier of each sensor.
     """
     drawn = [drawn_presses(tiers[0][0].config(config), order) for order in range(len(SENSORS))]
     wave_of = lambda tier: shortest_wave_mm(tier.config(config))
@@ -191,13 +187,9 @@ def _features(draws: DrawnPress, kernels: Kernels, tolerance: float, by: PressSe
 
 
 def read_press(drawn: DrawnPress, kernels: Kernels, tolerance: float, by: PressSetup) -> PressReadings:
-    """Press, measure and photograph, as the generator does.
+    """Press, measure and photograph, as the generator does, with the kernels of `by.sensors[0]` on `by.grid`.
 
-    Args:
-      drawn: the press.
-      kernels: `make_kernels(by.sensors[0], by.grid)`.
-      tolerance: of the contact solver.
-      by: the rest; with springs the pressure is wrong, the gel's response to it is not.
+    With springs the pressure is wrong, the gel's response to it is not.
     """
     press, unit, limits = drawn.press, drawn.unit, (tolerance, by.max_iterations)
     scenes = [Scene(press, unit, kernels, sensor, by.grid, limits) for sensor in by.sensors]

@@ -20,8 +20,7 @@ from experiments.mechanics.identify_probes import (
     SHAPE,
     SOURCES,
     STATIC,
-    ProbePredictions,
-    TransferPredictions,
+    Answers,
     points,
 )
 from sensors_io.schema import SENSORS
@@ -42,19 +41,19 @@ ENDS = {"from": "lower end of the 95 % interval over objects", "to": "upper end"
 class StudyPredictions:
     """Predictions of all probes, and their accuracies in % and losses in points, with intervals over objects.
 
-    Predictions are keyed as in `identify_probes`; `motion` and `still` by motion first, the press too.  `solved`,
-    `springs` and `exact` name the tiers, `noise` the multiples of the sensors' noise.
+    By touch and force at each level of `noise`, multiples of the sensors' own, and without touch; trained at each tier,
+    about that tier's own records and about the exact ones; by motion, the press too, without force and without touch.
     """
 
     noise: tuple[float, ...]
     exact: str
     solved: tuple[str, ...]
     springs: str
-    touch: dict[tuple[str, str, int], ProbePredictions]
-    blind: dict[tuple[str, str], ProbePredictions]
-    tiers: dict[tuple[str, str, str], TransferPredictions]
-    motion: dict[str, dict[tuple[str, str], ProbePredictions]]
-    still: dict[str, dict[tuple[str, str], ProbePredictions]]
+    touch: Sequence[Answers]
+    blind: Answers
+    tiers: Mapping[str, Sequence[Answers]]
+    motion: Mapping[str, Answers]
+    still: Mapping[str, Answers]
     pressed: PressData
     moved: dict[str, MotionData]
 
@@ -65,14 +64,18 @@ class StudyPredictions:
 
     def losses(self, tier: str, name: str, sources: tuple[str, ...]) -> np.ndarray:
         """Right answers about exact records less those by training at a tier instead, paired, [n, sources]."""
-        exact = [self.touch[name, source, self.own].right for source in sources]
-        cheap = [self.tiers[tier, name, source].exact.right for source in sources]
+        exact = [self.touch[self.own][name, source].right for source in sources]
+        cheap = [self.tiers[tier][1][name, source].right for source in sources]
         return np.stack(exact, 1) - np.stack(cheap, 1)
 
     @functools.cached_property
     def accuracy(self) -> dict[tuple[str, str, int], Interval]:
         """Accuracy by property, source and level of noise."""
-        return {key: points(answers.right, self.pressed.objects) for key, answers in self.touch.items()}
+        return {
+            (*key, level): points(one.right, self.pressed.objects)
+            for level, answers in enumerate(self.touch)
+            for key, one in answers.items()
+        }
 
     @functools.cached_property
     def blind_accuracy(self) -> dict[tuple[str, str], Interval]:
@@ -110,7 +113,7 @@ def touch_table(studied: StudyPredictions) -> Table:
                 **{f"noise ×{f:g}": studied.accuracy[name, source, i].mean for i, f in enumerate(studied.noise)},
                 "×1 from": own.low,
                 "×1 to": own.high,
-                "two levels off": studied.touch[name, source, studied.own].far_off,
+                "two levels off": studied.touch[studied.own][name, source].far_off,
             }
         )
     return _percent_table(
@@ -154,12 +157,13 @@ def tier_table(studied: StudyPredictions) -> Table:
     """Accuracy on exact records of probes trained at each tier."""
     rows: list[dict[str, Cell]] = []
     for (tier, name), lost in studied.lost.items():
-        answers = [studied.tiers[tier, name, sensor] for sensor in SENSORS]
+        right = [[answers[name, sensor].right for sensor in SENSORS] for answers in studied.tiers[tier]]
+        own, exact = (100 * float(np.mean(of_records)) for of_records in right)
         rows.append(
             {
                 "tier: property": f"{tier}: {name}",
-                "own records": 100 * float(np.mean([a.own.right for a in answers])),
-                "exact records": 100 * float(np.mean([a.exact.right for a in answers])),
+                "own records": own,
+                "exact records": exact,
                 "lost": lost.mean,
                 "from": lost.low,
                 "to": lost.high,

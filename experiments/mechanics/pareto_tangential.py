@@ -16,6 +16,7 @@ errs by a few per cent, as it promises, but handles neither twist nor reversal.
 """
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -190,16 +191,10 @@ def measure(task: str, gels: Sequence[GelContacts], rounds: int, context: Contex
     The error is the relative L₂ error of the marker displacement of every contact, or of every frame of a sequence, in
     units of the sequence's root mean square.
     """
-    work: list[tuple[Any, FrictionKernels]]
-    if task == SEQUENCE:
-        work = [(motion, gel.kernels) for gel in gels for motion in gel.sequences]
-        true = [methods.exact_sequence(*each) for each in work]
-        solve = lambda m: [methods.sequence(m.solve, *each, jnp.asarray(m.setting))[0] for each in work]
-    else:
-        work = [(gel.cases, gel.kernels) for gel in gels]
-        true = [methods.exact(task, *each) for each in work]
-        solve = lambda m: [methods.every(m.solve, *each, jnp.asarray(m.setting)) for each in work]
-    calls = {name: (lambda m=method: solve(m)) for name, method in METHODS[task].items()}
+    work = [(given, gel.kernels) for gel in gels for given in (gel.sequences if task == SEQUENCE else (gel.cases,))]
+    true = [methods.exact(task, *each) for each in work]
+    solve = lambda method: [methods.tractions(method, *each) for each in work]
+    calls = {name: functools.partial(solve, method) for name, method in METHODS[task].items()}
     shown = context.each(f"{task}: methods", calls.items())
     moved = lambda t, kernels: np.asarray(methods.marker_motion(jnp.asarray(t, jnp.complex64), kernels))
     exact = [moved(t, kernels) for t, (_, kernels) in zip(true, work, strict=True)]

@@ -248,11 +248,8 @@ def loop_table(data_dir: Path) -> Table:
 
     An elastic gel makes 0, a lossy one a positive area, a force that is read before the displacement a negative one.
 
-    Args:
-      data_dir: holds `RECORDING`.
-
     Raises:
-      ResultsError: no such file.
+      ResultsError: the directory does not hold `RECORDING`.
     """
     path = data_dir / RECORDING
     require(path.is_file(), "data_dir", data_dir, f"must hold {RECORDING}", "give the folder of the recordings")

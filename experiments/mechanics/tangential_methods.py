@@ -66,22 +66,34 @@ def sequence(
     return solve(motion, kernels, setting)
 
 
-def exact(task: str, cases: FrictionContact, kernels: FrictionKernels) -> np.ndarray:
-    """Tractions [S, N, N] of a task in float64, which a duality gap below 1e-8 proves.
+def tractions(method: FrictionMethod, given: FrictionContact | FrictionSequence, kernels: FrictionKernels) -> Array:
+    """Tractions of all contacts, or of all frames of a sequence, [S, N, N]."""
+    setting = jnp.asarray(method.setting)
+    if isinstance(given, FrictionSequence):
+        return sequence(method.solve, given, kernels, setting)[0]
+    return every(method.solve, given, kernels, setting)
+
+
+def exact(task: str, given: FrictionContact | FrictionSequence, kernels: FrictionKernels) -> np.ndarray:
+    """Tractions [S, N, N] in float64, which a duality gap below 1e-8 proves.
 
     Raises:
       RuntimeError: a gap that stays wider.
     """
     with jax.enable_x64(True):
-        found = every(_SOLVED[task], _double(cases), _double(kernels), jnp.asarray(EXACT_TOLERANCE))
-        return _proven(found.traction_mpa, found.residual)
-
-
-def exact_sequence(motion: FrictionSequence, kernels: FrictionKernels) -> np.ndarray:
-    """The same of all frames of a sequence."""
-    with jax.enable_x64(True):
-        found, (_, gap) = sequence(_exact_frames, _double(motion), _double(kernels), jnp.asarray(EXACT_TOLERANCE))
-        return _proven(found, gap)
+        wide = _double(given), _double(kernels), jnp.asarray(EXACT_TOLERANCE)
+        if task == SEQUENCE:
+            found, (_, gap) = sequence(_exact_frames, *wide)
+        else:
+            solved = every(_SOLVED[task], *wide)
+            found, gap = solved.traction_mpa, solved.residual
+        worst = float(jnp.max(gap))
+        if not worst < EXACT_TOLERANCE:
+            raise RuntimeError(
+                f"duality gap of the float64 reference is {worst:.1e}: must be < {EXACT_TOLERANCE:.0e}; "
+                "raise EXACT_ITERATIONS"
+            )
+        return np.asarray(found)
 
 
 @jax.jit
@@ -321,13 +333,3 @@ def _double(tree: Any) -> Any:
     """The same numbers in double precision."""
     wide = {np.dtype(np.float32): np.float64, np.dtype(np.complex64): np.complex128}
     return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf), wide[np.asarray(leaf).dtype]), tree)
-
-
-def _proven(tractions: Array, gap: Array) -> np.ndarray:
-    worst = float(jnp.max(gap))
-    if not worst < EXACT_TOLERANCE:
-        raise RuntimeError(
-            f"duality gap of the float64 reference is {worst:.1e}: must be < {EXACT_TOLERANCE:.0e}; "
-            "raise EXACT_ITERATIONS"
-        )
-    return np.asarray(tractions)

@@ -221,11 +221,10 @@ def shadow_gain(study: PressFit, context: Context) -> dict[str, float]:
       `explained`, the share of the residual variance of the held-out presses; `residual_levels` and `left_levels`, its
       standard deviation without and with shadows, in grey levels.
     """
-    presses, profiles = study.presses, study.profiles
     size = DIRECTIONS * len(ELEVATIONS_DEG)
     normal, right, held = np.zeros((size, size)), np.zeros((size, 3)), []
-    for i, (touch, picture) in context.each("shadows", enumerate(zip(study.touches, presses.pictures, strict=True))):
-        rows, left = _shadows(presses, profiles, touch), _residual(presses, profiles, touch, picture, study.fitted)
+    for i, touch in context.each("shadows", enumerate(study.touches)):
+        rows, left = _shadows(study, touch), residual(study, i)
         if i in study.held_out:
             held.append((rows, left))
         else:
@@ -241,23 +240,21 @@ def shadow_gain(study: PressFit, context: Context) -> dict[str, float]:
     }
 
 
-def _shadows(presses: BallPictures, profiles: Profiles, touch: np.ndarray) -> np.ndarray:
+def _shadows(study: PressFit, touch: np.ndarray) -> np.ndarray:
     """s at the pixels near a touch, [n, directions × elevations]."""
-    x, y = fitting.points(presses.axis_mm, touch)
-    here = profiles.field(touch, x, y)[0]
+    x, y = fitting.points(study.presses.axis_mm, touch)
+    here = study.profiles.field(touch, x, y)[0]
     found = []
     for angle in 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
         ray = x + REACH_MM[:, None] * np.cos(angle), y + REACH_MM[:, None] * np.sin(angle)
-        above = profiles.field(touch, *ray)[0] - here
+        above = study.profiles.field(touch, *ray)[0] - here
         tangents = np.tan(np.deg2rad(ELEVATIONS_DEG))
         found += [np.maximum(above - REACH_MM[:, None] * tangent, 0).max(0) for tangent in tangents]
     return np.stack(found, -1)
 
 
-def _residual(
-    presses: BallPictures, profiles: Profiles, touch: np.ndarray, picture: np.ndarray, optics: PhotometricOptics
-) -> np.ndarray:
-    """Change near a touch that the optics do not explain, [n, 3]."""
-    near = fitting.near(presses.axis_mm, touch)
-    made = fitting.change(optics, profiles, touch, presses.axis_mm, presses.window_mm)
-    return (picture - presses.background - made)[near]
+def residual(study: PressFit, i: int) -> np.ndarray:
+    """Change near touch `i` that the fitted optics do not explain, [n, 3]."""
+    presses, touch = study.presses, study.touches[i]
+    made = fitting.change(study.fitted, study.profiles, touch, presses.axis_mm, presses.window_mm)
+    return (presses.pictures[i] - presses.background - made)[fitting.near(presses.axis_mm, touch)]

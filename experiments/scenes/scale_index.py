@@ -1,6 +1,5 @@
 """The index of a data set of many contacts that were never recorded: what it costs to open, search and extend it."""
 
-import dataclasses
 import multiprocessing
 import re
 import statistics
@@ -17,35 +16,15 @@ META = RecordsMeta(source="synthetic", licence="none", config_hash="none", senso
 PER_SHARD, PER_OBJECT, SEARCHES = 1000, 100, 200
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class IndexCost:
-    """Costs of one index.
+def index_cost(root: Path, contacts: int, publications: int) -> dict[str, float]:
+    """Write the index of so many contacts in an empty folder, then measure it in a process of its own.
 
-    Attributes:
-      contacts: that it lists.
-      open_s: seconds of the clock to open it.
-      open_cpu_s: seconds of a core.
-      peak_mb: memory of a process that opens it, searches it and draws a split, above that of the imports.
-      find_ms: of the clock for one contact by its key, after the first search, which sorts for `sort_s`.
-      sort_s: seconds of the clock.
-      publish_ms: of a core to make one more shard visible, the median.
-      published_ms: of the clock for the same, which waits for the disk.
-      bytes: of its files.
+    Returns:
+      `open_s`, `open_cpu_s`: seconds of the clock and of a core to open it; `peak_mb`: memory of a process that opens
+      it, searches it and draws a split, above that of the imports; `find_ms`: of the clock for one contact by its key,
+      after the first search, which sorts for `sort_s`; `publish_ms`: median of a core to make one more shard visible;
+      `published_ms`: of the clock for the same, which waits for the disk; `contacts`, `bytes` of its files.
     """
-
-    contacts: int
-    open_s: float
-    open_cpu_s: float
-    peak_mb: float
-    find_ms: float
-    sort_s: float
-    publish_ms: float
-    published_ms: float
-    bytes: int
-
-
-def index_cost(root: Path, contacts: int, publications: int) -> IndexCost:
-    """Write the index of so many contacts in an empty folder, then measure it in a process of its own."""
     index = _written(root, contacts)
     size = sum(file.stat().st_size for file in root.iterdir())
     with multiprocessing.get_context("spawn").Pool(1) as pool:
@@ -60,7 +39,7 @@ def index_cost(root: Path, contacts: int, publications: int) -> IndexCost:
         index.write(root)
         spent.append((time.process_time() - began[0], time.perf_counter() - began[1]))
     cpu_ms, ms = (1e3 * statistics.median(each) for each in zip(*spent, strict=True))
-    return IndexCost(contacts=contacts, publish_ms=cpu_ms, published_ms=ms, bytes=size, **read)
+    return {"contacts": contacts, **read, "publish_ms": cpu_ms, "published_ms": ms, "bytes": size}
 
 
 def _written(root: Path, contacts: int) -> Index:
@@ -98,8 +77,8 @@ def _read(root: Path, contacts: int) -> dict[str, float]:
     if found != drawn:
         raise RuntimeError(f"the index finds {found[:3]} where {drawn[:3]} were asked for: mend `ContactTable.find`")
     np.flatnonzero(np.ones(objects, bool)[index.contacts.rows["object"]])  # as `RecordStore.contacts_of_split`
-    found_at = {"find_ms": find_ms, "sort_s": sort_s, "peak_mb": _memory_mb("VmHWM") - kept}
-    return {"open_s": open_s, "open_cpu_s": open_cpu_s, **found_at}
+    peak_mb = _memory_mb("VmHWM") - kept
+    return {"open_s": open_s, "open_cpu_s": open_cpu_s, "peak_mb": peak_mb, "find_ms": find_ms, "sort_s": sort_s}
 
 
 def _memory_mb(name: str) -> float:

@@ -29,7 +29,7 @@ import numpy as np
 from experiments.core.context import Context
 from experiments.core.results import Results, Table, at_most, named_table
 from experiments.core.runner import Experiment
-from experiments.scenes.scale_index import IndexCost, index_cost
+from experiments.scenes.scale_index import index_cost
 from experiments.scenes.throughput_rates import write_rate
 from sensors_io.generate import RECORDS_PER_SHARD
 from sensors_io.pipeline import ClipConfig, make_clip
@@ -40,6 +40,9 @@ from sensors_io.schema import SENSORS
 
 MOST_OPEN_S, MOST_MB, MOST_FIND_MS, MOST_GROWTH = 3.0, 500.0, 1.0, 1.5
 """Requirements on the index: to open it, its memory, a contact by key, publishing late over publishing early."""
+
+Units = Mapping[str, float]
+"""Measured figures by name: those of `measure_units`, or of `index_cost`."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -71,46 +74,30 @@ class BillionConfig:
     machine: AssumedMachine = AssumedMachine()
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RecordUnits:
-    """Measured: milliseconds of a core and bytes of a record; requests of a shard sent and read; ms to make a clip."""
-
-    cpu_ms: float
-    bytes: float
-    sent: float
-    read: float
-    clip_ms: float
-
-
 def run(config: BillionConfig, context: Context) -> Results:
     """Measure the units, multiply."""
-    units = RecordUnits(**context.once("units/0", functools.partial(measure_units, config, context)))
-    few, many = (
-        IndexCost(**context.once(f"index/{n}", functools.partial(_index, n, config.publications)))
-        for n in config.indexed
-    )
-    growth = many.publish_ms / few.publish_ms
+    units = context.once("units/0", functools.partial(measure_units, config, context))
+    few, many = (context.once(f"index/{n}", functools.partial(_index, n, config.publications)) for n in config.indexed)
+    growth = many["publish_ms"] / few["publish_ms"]
     rows = [simulated(config, units, many, machines) for machines in config.machines]
     shards = -(-config.records // RECORDS_PER_SHARD)
-    hours = config.records * units.cpu_ms / 3.6e6
+    hours = config.records * units["cpu_ms"] / 3.6e6
     return Results(
         verdict=(
             f"Simulated: {config.records:,} records cost {hours:,.0f} hours of a core and "
-            f"{config.records * units.bytes / 1e12:.3g} TB in {shards:,} shards, "
-            f"{shards * units.sent:,.0f} requests to write and {shards * units.read:,.0f} to read all of them once.",
+            f"{config.records * units['bytes'] / 1e12:.3g} TB in {shards:,} shards, {shards * units['sent']:,.0f} "
+            f"requests to write and {shards * units['read']:,.0f} to read all of them once.",
             "What limits: " + ", ".join(f"{row['limit']} on {row['machines']:,}" for row in rows) + " machines.",
         ),
         requirements=(
-            at_most("opens", many.open_s, MOST_OPEN_S, "s", f"{many.contacts:,} contacts"),
-            at_most("memory", many.peak_mb, MOST_MB, "MB", "with a search and a split"),
-            at_most("contact by key", many.find_ms, MOST_FIND_MS, "ms"),
+            at_most("opens", many["open_s"], MOST_OPEN_S, "s", f"{many['contacts']:,} contacts"),
+            at_most("memory", many["peak_mb"], MOST_MB, "MB", "with a search and a split"),
+            at_most("contact by key", many["find_ms"], MOST_FIND_MS, "ms"),
             at_most("one more shard, late over early", growth, MOST_GROWTH, note="time of a core"),
         ),
         tables=(
-            named_table(
-                "Measured: a record", [{"unit": "here", **dataclasses.asdict(units)}], note="Requests a shard."
-            ),
-            named_table("Measured: the index", [dataclasses.asdict(one) for one in (few, many)]),
+            named_table("Measured: a record", [{"unit": "here", **units}], note="Requests a shard."),
+            named_table("Measured: the index", [few, many]),
             cost_table(config, units, many),
             named_table(f"Simulated: {config.records:,} records", rows, note="The slowest of the four limits."),
         ),
@@ -118,13 +105,16 @@ def run(config: BillionConfig, context: Context) -> Results:
     )
 
 
-def _index(contacts: int, publications: int) -> Mapping[str, Any]:
+def _index(contacts: int, publications: int) -> Units:
     with tempfile.TemporaryDirectory() as folder:
-        return dataclasses.asdict(index_cost(Path(folder), contacts, publications))
+        return index_cost(Path(folder), contacts, publications)
 
 
-def measure_units(config: BillionConfig, context: Context) -> Mapping[str, Any]:
-    """Make the scenes, send them to a store, read them from there; fields of `RecordUnits`."""
+def measure_units(config: BillionConfig, context: Context) -> Units:
+    """Make the scenes, send them to a store, and read them from there.
+
+    Milliseconds of a core and bytes of a record; requests of a shard sent and read; milliseconds to make a clip.
+    """
     with tempfile.TemporaryDirectory() as folder:
         out, bucket = Path(folder) / "records", f"/{Path(folder).name}"
         with context.progress_callback("making scenes") as report:
@@ -141,7 +131,7 @@ def measure_units(config: BillionConfig, context: Context) -> Mapping[str, Any]:
         took = _clip_ms(records)
         fsspec.filesystem("memory").rm(bucket, recursive=True)
     requests = {"sent": sent / len(shards), "read": calls.total() / len(shards)}
-    return {"cpu_ms": rate.cpu_ms, "bytes": size, "clip_ms": took, **requests}
+    return {"cpu_ms": rate.cpu_ms, "bytes": size, **requests, "clip_ms": took}
 
 
 def _count(mirror: Mirror, calls: collections.Counter[str]) -> None:
@@ -166,45 +156,45 @@ def _clip_ms(records: RecordStore) -> float:
     return float(np.median(took))
 
 
-def simulated(config: BillionConfig, units: RecordUnits, index: IndexCost, machines: int) -> dict[str, Any]:
+def simulated(config: BillionConfig, units: Units, index: Units, machines: int) -> dict[str, Any]:
     """Hours to make all records on so many machines, what limits them, and a machine's time to its first batch."""
     assumed, shards = config.machine, config.records / RECORDS_PER_SHARD
     hours = {
-        "compute": config.records * units.cpu_ms / 3.6e6 / assumed.cores / machines,
-        "upload": config.records * units.bytes / 1e9 / assumed.bandwidth_gb_s / 3600 / machines,
-        "the driver": shards * index.published_ms / 3.6e6,
-        "requests": shards * units.sent / assumed.requests_per_s / 3600,
+        "compute": config.records * units["cpu_ms"] / 3.6e6 / assumed.cores / machines,
+        "upload": config.records * units["bytes"] / 1e9 / assumed.bandwidth_gb_s / 3600 / machines,
+        "the driver": shards * index["published_ms"] / 3.6e6,
+        "requests": shards * units["sent"] / assumed.requests_per_s / 3600,
     }
     limit = max(hours, key=lambda name: hours[name])
     contacts = config.records / len(SENSORS) / config.scenes.frame_count
-    shard_bytes, index_bytes = RECORDS_PER_SHARD * units.bytes, index.bytes * contacts / index.contacts
+    shard_bytes, index_bytes = RECORDS_PER_SHARD * units["bytes"], index["bytes"] * contacts / index["contacts"]
     loaded_s = (config.batch * shard_bytes + index_bytes) / 1e9 / assumed.bandwidth_gb_s
-    asked_s = (config.batch * units.read + 2) * assumed.latency_ms / 1e3 / assumed.cores
-    opened_s = index.open_s * contacts / index.contacts
+    asked_s = (config.batch * units["read"] + 2) * assumed.latency_ms / 1e3 / assumed.cores
+    opened_s = index["open_s"] * contacts / index["contacts"]
     return {
         "machines": machines,
         "limit": limit,
         **{f"{name}, h": value for name, value in hours.items()},
         "wall, h": hours[limit],
         "price": hours[limit] * machines * assumed.hourly_price,
-        "first batch, s": loaded_s + asked_s + opened_s + config.batch * units.clip_ms / 1e3 / assumed.cores,
+        "first batch, s": loaded_s + asked_s + opened_s + config.batch * units["clip_ms"] / 1e3 / assumed.cores,
     }
 
 
-def cost_table(config: BillionConfig, units: RecordUnits, index: IndexCost) -> Table:
+def cost_table(config: BillionConfig, units: Units, index: Units) -> Table:
     """Counts of all records."""
     shards = config.records / RECORDS_PER_SHARD
     contacts = config.records / len(SENSORS) / config.scenes.frame_count
     figures = {
-        "hours of a core": config.records * units.cpu_ms / 3.6e6,
-        "TB": config.records * units.bytes / 1e12,
+        "hours of a core": config.records * units["cpu_ms"] / 3.6e6,
+        "TB": config.records * units["bytes"] / 1e12,
         "contacts": contacts,
         "shards": shards,
-        "requests to write": shards * units.sent,
-        "requests to read all once": shards * units.read,
-        "GB of the index": index.bytes * contacts / index.contacts / 1e9,
-        "s to open the index": index.open_s * contacts / index.contacts,
-        "MB of memory of a reader": index.peak_mb * contacts / index.contacts,
+        "requests to write": shards * units["sent"],
+        "requests to read all once": shards * units["read"],
+        "GB of the index": index["bytes"] * contacts / index["contacts"] / 1e9,
+        "s to open the index": index["open_s"] * contacts / index["contacts"],
+        "MB of memory of a reader": index["peak_mb"] * contacts / index["contacts"],
     }
     rows = [{"figure": name, "simulated": value} for name, value in figures.items()]
     return named_table(f"Simulated: all of {config.records:,} records", rows, formats={"simulated": ",.4g"})

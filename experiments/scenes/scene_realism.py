@@ -42,23 +42,6 @@ RIDGE = 1e-3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PictureDistances:
-    """Between two sets of pictures, in grey levels but for the spectrum.
-
-    Args:
-      pixel: rms difference of pictures of the same scene.
-      intensity: Wasserstein-1 distance of the intensities, mean over the channels.
-      gradient: the same for the magnitudes of the gradient, levels per pixel.
-      spectrum_db: rms over rings of wave numbers of 10 log₁₀ of the ratio of the powers, mean over the channels.
-    """
-
-    pixel: float
-    intensity: float
-    gradient: float
-    spectrum_db: float
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class PatchClassifier:
     """A logistic regression on statistics of patches: levels, contrast, spectrum, steps, channels' correlation, peaks.
 
@@ -100,11 +83,12 @@ def run(config: RealismConfig, context: Context) -> Results:
     shadows = realism_fit.shadow_gain(study, context)
     clean, stored = (realism_fit.clean(study, optics) for optics in (study.fitted, photometric.MINI))
     drift = float(np.sqrt(np.mean((clean - stored) ** 2)))
-    (before, *_), (after, right, error) = rows["lamps by eye"], rows["fitted, with grain"]
+    before, after = rows["lamps by eye"], rows["fitted, with grain"]
     return Results(
         verdict=(
-            f"Fitted optics bring pictures from {before.pixel:.1f} to {after.pixel:.1f} grey levels of real ones; "
-            f"a classifier assigns {right:.0f} ± {error:.0f} % of the patches to the right set, 50 % would be chance.",
+            f"Fitted optics bring pictures from {before['difference']:.1f} to {after['difference']:.1f} grey levels of "
+            f"real ones; a classifier assigns {after['right']:.0f} ± {after['±']:.0f} % of the patches to the right "
+            "set, 50 % would be chance.",
             f"Cast shadows would explain {100 * shadows['explained']:.1f} % of the residual of the fit.",
         ),
         requirements=(
@@ -125,30 +109,19 @@ def run(config: RealismConfig, context: Context) -> Results:
 
 def compare(
     real: np.ndarray, made: np.ndarray, study: realism_fit.PressFit, judge: PatchClassifier
-) -> tuple[PictureDistances, float, float]:
+) -> dict[str, float]:
     """Distances, accuracy of the classifier and its standard error, both in %."""
     axis = study.presses.axis_mm
     x, y, _ = study.touches[study.held_out].T
     centres = np.stack([np.interp(c, axis, np.arange(len(axis))) for c in (y, x)], -1)
     mean, error = accuracy(real, made, centres, judge)
-    return distances(real, made), 100 * mean, 100 * error
+    return {**distances(real, made), "right": 100 * mean, "±": 100 * error}
 
 
-def _distance_table(rows: Mapping[str, tuple[PictureDistances, float, float]]) -> Table:
+def _distance_table(rows: Mapping[str, Mapping[str, float]]) -> Table:
     return named_table(
         "Distance of generated from real held-out presses",
-        [
-            {
-                "pictures": name,
-                "difference": found.pixel,
-                "intensity": found.intensity,
-                "gradient": found.gradient,
-                "spectrum": found.spectrum_db,
-                "right": mean,
-                "±": error,
-            }
-            for name, (found, mean, error) in rows.items()
-        ],
+        [{"pictures": name, **row} for name, row in rows.items()],
         formats={"right": ".1f", "±": ".1f"},
         units={
             **{"difference": "levels", "intensity": "levels", "gradient": "levels/px"},
@@ -167,18 +140,13 @@ def _distance_table(rows: Mapping[str, tuple[PictureDistances, float, float]]) -
 
 def _fit_table(study: realism_fit.PressFit) -> Table:
     """Share of the change near the contact that the fit explains, and the residual."""
-    axis, presses = study.presses.axis_mm, study.presses
+    presses = study.presses
+    change = lambda i: (presses.pictures[i] - presses.background)[fitting.near(presses.axis_mm, study.touches[i])]
     rows: list[dict[str, Cell]] = []
     for name, held_out in (("fitted", False), ("held out", True)):
-        left, change = [], []
-        for i in (i for i in range(len(study.touches)) if (i in study.held_out) == held_out):
-            x, y, _ = study.touches[i]
-            near = np.hypot(axis[None] - x, axis[:, None] - y) < fitting.NEAR_MM
-            seen = presses.pictures[i] - presses.background
-            made = fitting.change(study.fitted, study.profiles, study.touches[i], axis, presses.window_mm)
-            change.append(seen[near])
-            left.append((seen - made)[near])
-        a, b = np.concatenate(left), np.concatenate(change)
+        chosen = [i for i in range(len(study.touches)) if (i in study.held_out) == held_out]
+        a = np.concatenate([realism_fit.residual(study, i) for i in chosen])
+        b = np.concatenate([change(i) for i in chosen])
         explained, levels = 100 * (1 - a.var(0) / b.var(0)), 255 * a.std(0)
         row = {f"{c} explained": float(v) for c, v in zip("RGB", explained, strict=True)}
         rows.append({"presses": name, **row, **{f"{c} left": float(v) for c, v in zip("RGB", levels, strict=True)}})
@@ -206,28 +174,28 @@ def _side_by_side(real: np.ndarray, rendered: Mapping[str, np.ndarray]) -> Pictu
 # Distances of two sets of pictures -----------------------------------------------------------------------------------
 
 
-def distances(real: np.ndarray, made: np.ndarray) -> PictureDistances:
-    """Statistics of `made` against `real`, both [P, N, N, 3] of the same scenes."""
+def distances(real: np.ndarray, made: np.ndarray) -> dict[str, float]:
+    """Distances of `made` from `real`, both [P, N, N, 3] of the same scenes, in grey levels but for the spectrum.
+
+    Root mean square difference; Wasserstein-1 distances of intensities and of gradients (levels per pixel), means over
+    the channels; root mean square over rings of wave numbers of 10 log₁₀ of the ratio of the powers, mean over them.
+    """
     a, b = (pictures.astype(np.float64) for pictures in (real, made))
     spectra = 10 * np.log10(_ring_power(a) / _ring_power(b))
-    return PictureDistances(
-        pixel=float(np.sqrt(np.mean((a - b) ** 2))),
-        intensity=_wasserstein(a, b),
-        gradient=_wasserstein(_gradient(a), _gradient(b)),
-        spectrum_db=float(np.sqrt(np.mean(spectra**2, 0)).mean()),
-    )
+    return {
+        "difference": float(np.sqrt(np.mean((a - b) ** 2))),
+        "intensity": _wasserstein(a, b),
+        "gradient": _wasserstein(_gradient(a), _gradient(b)),
+        "spectrum": float(np.sqrt(np.mean(spectra**2, 0)).mean()),
+    }
 
 
 def accuracy(real: np.ndarray, made: np.ndarray, centres: np.ndarray, judge: PatchClassifier) -> tuple[float, float]:
     """Share of held-out patches that a classifier assigns to the right set, and its standard error over pictures.
 
     Two folds: trained on the patches of half of the pictures, tested on those of the other half; 0.5 means that the
-    sets cannot be distinguished (Lopez-Paz & Oquab 2017, classifier two-sample test).
-
-    Args:
-      real, made: [P, N, N, 3], P ≥ 4.
-      centres: [P, 2], row and column near which patches are cut, the same in both sets.
-      judge: the classifier.
+    sets cannot be distinguished (Lopez-Paz & Oquab 2017, classifier two-sample test).  Patches are cut near the same
+    centres (row, column) [P, 2] of both sets [P, N, N, 3], P ≥ 4.
     """
     if len(real) < 4:
         raise ValueError(f"real holds {len(real)} pictures: must be ≥ 4 for two folds; give more")

@@ -242,20 +242,9 @@ def killed_and_resumed(
 ) -> int:
     """Run the command that writes records, kill it with SIGKILL at random moments, let the last run finish.
 
-    A moment is a random shard, another each time, and a random part of the time in which it is written; the first shard
-    takes in the start of the process and its compiling.
-
-    Args:
-      command: `python -m sensors_io generate …`.
-      out: directory of the records.
-      kills: number of kills, < `shards`.
-      shards: that the finished set has.
-      shard_s: seconds that an undisturbed writer takes for one.
-      seed: of the moments.
-      advance: called after each kill, and after the last run.
-
-    Returns:
-      Number of runs that were killed before they ended.
+    A moment is a random shard, another each time, and a random part of the time in which it is written (`shard_s` by an
+    undisturbed writer); the first shard takes in the start of the process and its compiling.  Returns the number of
+    runs that were killed before they ended; `advance` is called after each of them, and after the last run.
 
     Raises:
       ValueError: as many kills as shards, or more.

@@ -10,9 +10,8 @@ from rich.console import Console
 
 from experiments.core.context import Context
 from experiments.engine import throughput_feed
-from experiments.engine.feeding import FeedScale, idle_share
 from experiments.engine.matrix_floor import count_flops
-from experiments.engine.throughput_feed import SMOKE
+from experiments.engine.throughput_feed import SMOKE, FeedScale, idle_share
 from tests.experiments import tiny
 from touchr1_jax.models.vmappable_dense import linear
 

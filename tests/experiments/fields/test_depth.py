@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.fields.depth_checks import analytic_surfaces, scale_error
+from experiments.fields.depth_accuracy import analytic_surfaces, scale_error
 from experiments.fields.depth_methods import INTEGRATORS, MAPS
 from experiments.fields.stressed_readings import depth_outcome
 from sensors_io.calibration.circles import find_circles
