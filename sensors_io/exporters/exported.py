@@ -1,10 +1,11 @@
 """Records back from an export, whichever format it has."""
 
+import contextlib
 import pathlib
 
-from sensors_io.exporters.arrays import import_arrays
-from sensors_io.exporters.lerobot import OURS, import_lerobot
-from sensors_io.exporters.selection import ExportError, Progress
+from sensors_io.exporters.arrays import read_arrays
+from sensors_io.exporters.lerobot import OURS, read_lerobot
+from sensors_io.exporters.selection import ExportError, Progress, damage_named, write_back
 
 
 def import_exported(path: pathlib.Path, out: pathlib.Path, progress: Progress) -> None:
@@ -21,7 +22,8 @@ def import_exported(path: pathlib.Path, out: pathlib.Path, progress: Progress) -
     """
     if not path.exists():
         raise ExportError(f"{path} does not exist: must be a folder or file that `export` wrote; correct the path")
-    if (path / OURS).is_dir():
-        import_lerobot(path, out, progress)
-    else:
-        import_arrays(path, out, progress)
+    with contextlib.ExitStack() as stack:
+        with damage_named(path):
+            lerobot = (path / OURS).is_dir()
+            found = read_lerobot(path) if lerobot else stack.enter_context(read_arrays(path))
+        write_back(path, found, out, progress)
