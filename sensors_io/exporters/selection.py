@@ -242,6 +242,8 @@ def write_back(path: pathlib.Path, found: FoundExport, out: pathlib.Path, progre
             if card.object_id not in writer.objects_done:
                 writer.write_object(card)
         for done, contact in enumerate(_read(path, found.contacts), 1):
+            if not contact:
+                raise ExportError(f"{path}: contact {done} holds no sequence; export the records again")
             if contact[0].key not in writer:
                 writer.write_contact(contact)
             sequences += len(contact)

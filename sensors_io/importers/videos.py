@@ -21,7 +21,7 @@ import numpy as np
 
 from sensors_io.importers.catalogue import Catalogue, Listed, Taken, fingerprint, require_files
 from sensors_io.importers.holdout import split_by_name
-from sensors_io.importers.keep import ImportConfig, ImportSourceError, Skip
+from sensors_io.importers.keep import LEAST_HZ, MOST_HZ, ImportConfig, ImportSourceError, Skip
 from sensors_io.importers.label_table import COLUMNS, ID, NAME, SPLIT, LabelRow, LabelsError, read_labels
 from sensors_io.importers.pictures import film, natural, nominal_ns, numbered, read_pictures
 from sensors_io.importers.video import read_video
@@ -54,8 +54,10 @@ class VideosConfig(ImportConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.rate_hz > 0:
-            raise ImportSourceError(f"rate_hz is {self.rate_hz}: must be > 0; give the frame rate of the pictures")
+        if not LEAST_HZ <= self.rate_hz <= MOST_HZ:
+            raise ImportSourceError(
+                f"rate_hz is {self.rate_hz}: must lie in {LEAST_HZ:g} … {MOST_HZ:g}; give the frame rate of the pictures"
+            )
 
 
 def list_videos(source: pathlib.Path, config: VideosConfig) -> Catalogue:
@@ -71,6 +73,8 @@ def list_videos(source: pathlib.Path, config: VideosConfig) -> Catalogue:
     require_files(source, clips, f"videos ({', '.join(SUFFIXES)}) or folders of pictures")
     named = {(p.relative_to(source).as_posix() if p != source else p.resolve().name): p for p in clips}
     rows = {} if config.labels is None else read_labels(config.labels, CLIP, (CLIP, *COLUMNS))
+    if config.labels is not None and not rows:
+        raise LabelsError(f"{config.labels} has no row: must list clips; complete it, or leave --labels out")
     by_name: dict[str, list[str]] = {}
     for clip in named:
         for known in {clip, _plain(clip)}:

@@ -142,6 +142,7 @@ def test_what_cannot_be_exported_or_read_is_one_line(tmp_path, monkeypatch):
     refused(ExportError, r"contacts is \[3\]: must lie in 0..0", Selected, store=store, rows=(3,))
     read = functools.partial(import_exported, out=tmp_path / "back", progress=SILENT)
     refused(ExportError, "does not exist", read, tmp_path / "gone")
+    refused(ExportError, "the export itself", import_exported, records, records, SILENT)
     pytest.importorskip("h5py")
     export("hdf5", records, tmp_path / "a.h5")
     refused(ExportError, "must not exist yet", export, "hdf5", records, tmp_path / "a.h5")
@@ -164,6 +165,11 @@ def halved(path: pathlib.Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
+def emptied(contacts: pathlib.Path) -> None:
+    """Leave a contact without sequences."""
+    shutil.rmtree(contacts / "000001" / "tac3d")
+
+
 ARRAY = "contacts/000001/tac3d/force_n"
 
 
@@ -176,6 +182,7 @@ ARRAY = "contacts/000001/tac3d/force_n"
         ("zarr", "contacts/000001", shutil.rmtree),
         ("zarr", "objects/000000/view_depth_mm/c/0/0", pathlib.Path.unlink),
         ("zarr", "backgrounds/rest.png", shutil.rmtree),
+        ("zarr", "contacts", emptied),
         ("lerobot", "videos/observation.images.gelsight_mini/chunk-000/file-000.mp4", halved),
         ("lerobot", "videos/observation.images.gelsight_mini/chunk-000/file-000.mp4", damaged),
         ("lerobot", "data/chunk-000/file-000.parquet", damaged),
