@@ -225,8 +225,8 @@ def _stream(entry: _Entry) -> StreamMap:
     stated = isinstance(rate, (int, float)) and not isinstance(rate, bool) and LEAST_HZ <= rate <= MOST_HZ
     if "host_time_ns" in arrays or rate is None or not stated:
         raise ImportSourceError(
-            f"{entry.name}: rate_hz is {rate!r}: must lie in {LEAST_HZ:g} … {MOST_HZ:g} where no host_time_ns is named, and "
-            "absent otherwise; give one of them"
+            f"{entry.name}: rate_hz is {rate!r}: must lie in {LEAST_HZ:g} … {MOST_HZ:g} where no host_time_ns is "
+            "named, and absent otherwise; give one of them"
         )
     return StreamMap(arrays=arrays, rate_hz=float(rate))
 

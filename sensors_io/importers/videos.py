@@ -56,7 +56,7 @@ class VideosConfig(ImportConfig):
         super().__post_init__()
         if not LEAST_HZ <= self.rate_hz <= MOST_HZ:
             raise ImportSourceError(
-                f"rate_hz is {self.rate_hz}: must lie in {LEAST_HZ:g} … {MOST_HZ:g}; give the frame rate of the pictures"
+                f"rate_hz is {self.rate_hz}: must lie in {LEAST_HZ:g} … {MOST_HZ:g}; give that of the pictures"
             )
 
 
