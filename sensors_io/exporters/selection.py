@@ -69,6 +69,10 @@ class Selected:
         if wrong:
             raise ExportError(f"sensors is {', '.join(wrong)}: must be of {', '.join(have)}; correct it")
         outside = [row for row in self.rows if not 0 <= row < len(self.store)]
+        if len(set(self.rows)) < len(self.rows):
+            raise ExportError(
+                f"contacts is {list(self.rows)}: must name each contact once; leave out what is named again"
+            )
         if outside or not len(self.store):
             raise ExportError(
                 f"contacts is {outside or 'empty'}: must lie in 0..{len(self.store) - 1}; `list` shows the records"

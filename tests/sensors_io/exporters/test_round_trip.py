@@ -140,6 +140,7 @@ def test_what_cannot_be_exported_or_read_is_one_line(tmp_path, monkeypatch):
     store = RecordStore(records)
     refused(ExportError, "sensors is digit: must be of gelsight_mini", Selected, store=store, sensors=("digit",))
     refused(ExportError, r"contacts is \[3\]: must lie in 0..0", Selected, store=store, rows=(3,))
+    refused(ExportError, r"contacts is \[0, 0\]: must name each contact once", Selected, store=store, rows=(0, 0))
     read = functools.partial(import_exported, out=tmp_path / "back", progress=SILENT)
     refused(ExportError, "does not exist", read, tmp_path / "gone")
     refused(ExportError, "the export itself", import_exported, records, records, SILENT)
