@@ -150,7 +150,7 @@ def _checksum(arrays: Mapping[str, Any]) -> int:
     for name, array in sorted(arrays.items()):
         if array is not None:
             crc = zlib.crc32(f"{name} {array.dtype.str} {array.shape} ".encode(), crc)
-            crc = zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8), crc)
+            crc = zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data, crc)
     return crc
 
 
