@@ -1,6 +1,6 @@
 """`python -m experiments`: run, continue, list, start and compare experiments, ask trained policies."""
 
-import errno
+import contextlib
 import multiprocessing
 import os
 import signal
@@ -49,10 +49,9 @@ def main() -> None:
     except KeyboardInterrupt:  # a run handles the signal itself
         print_error("Stopped before any work began.")
         status = SIGNALLED + signal.SIGINT
-    except OSError as error:
-        if error.errno != errno.ENOSPC:
-            raise
-        print_error(f"{type(error).__name__}: {error}: the output cannot be written; free some space")
+    except OSError as error:  # a folder that cannot be read or written, a full disk, a pipe that was closed
+        with contextlib.suppress(OSError):
+            print_error(f"{type(error).__name__}: {error}: correct the path, its permissions, or free some space")
         status = 1
     leave(status)
 

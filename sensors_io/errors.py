@@ -1,5 +1,6 @@
 """Base class of all errors that are meant for a user, and those that foreign bytes raise."""
 
+import os
 import struct
 
 MALFORMED = (
@@ -13,3 +14,17 @@ names the file instead.  `SyntaxError` is NumPy's for the name of a type.
 
 class UserError(Exception):
     """Its message names the field, the value, the constraint and the fix, so that a command prints it as one line."""
+
+
+def path_text(path: str | os.PathLike[str]) -> str:
+    """A path as text for OpenCV, which crashes where a name is not UTF-8.
+
+    Raises:
+      UserError: it is not.
+    """
+    text = os.fspath(path)
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise UserError(f"path is {text!r}: must be UTF-8; rename it") from error
+    return text

@@ -61,7 +61,7 @@ class Mirror:
             fix = "must be of a kind that fsspec knows, its package installed; pip install 'touchr1-jax[cloud]'"
             raise StoreError(f"{self.url} cannot be opened ({error}): {fix}") from error
         self._cache = pathlib.Path(os.environ.get(CACHE, "~/.cache/touchr1")).expanduser()
-        self._most = int(float(os.environ.get(CACHE_GB, "50")) * 1e9)
+        self._most = _cache_bytes(os.environ.get(CACHE_GB, "50"))
 
     def __str__(self) -> str:
         return self.url
@@ -209,6 +209,16 @@ def place(path: str | os.PathLike[str]) -> Place:
 def local(root: Place, name: str, size: int | None = None) -> pathlib.Path:
     """A file of a folder on this machine; see `Mirror.fetch`."""
     return root / name if isinstance(root, pathlib.Path) else root.fetch(name, size)
+
+
+def _cache_bytes(stated: str) -> int:
+    try:
+        size = float(stated)
+    except ValueError:
+        size = -1.0
+    if not 0 <= size <= 1e9:
+        raise StoreError(f"{CACHE_GB} is {stated!r}: must be a number of gigabytes ≥ 0; correct it, or unset it")
+    return int(size * 1e9)
 
 
 def _md5(path: pathlib.Path) -> str:

@@ -238,10 +238,22 @@ def read_run(directory: Path) -> PastRun:
     return PastRun(
         directory=directory,
         description=read_description(directory),
-        seconds=read_json(times).get("total") if times.exists() else None,  # stages come before the total
-        results=read_json(results) if results.exists() else None,
+        seconds=_object(times).get("total") if times.exists() else None,  # stages come before the total
+        results=_object(results, "verdict") if results.exists() else None,
         in_use=_in_use(directory),
     )
+
+
+def _object(path: Path, *lists: str) -> dict[str, Any]:
+    """A JSON object of a run, in which some names hold lists.
+
+    Raises:
+      DamagedFileError: it is none.
+    """
+    found = read_json(path)
+    if not isinstance(found, dict) or not all(isinstance(found.get(name), list) for name in lists):
+        raise DamagedFileError(f"{path} is not that of a run: put a copy back, or move its run away")
+    return found
 
 
 def _in_use(directory: Path) -> bool:

@@ -3,6 +3,7 @@
 import contextlib
 import io
 import resource
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -104,15 +105,18 @@ def replaced(path: Path, old: str, new: str) -> None:
 def full_disk(folder: Path, most_bytes: int = 6_000) -> Iterator[None]:
     """No file can grow past so many bytes, as on a disk without space; the error's number is another (EFBIG).
 
-    The counting run's small files fit; its report, which grows with its log, does not.
+    The counting run's small files fit; its report, which grows with its log, does not.  Python compiles no module to
+    a file meanwhile: one that is cut off breaks every later import.
     """
     del folder
+    before, sys.dont_write_bytecode = sys.dont_write_bytecode, True
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, hard))
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        sys.dont_write_bytecode = before
 
 
 class _Enough(Exception):

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from sensors_io.calibration.presses import BallPresses
+from sensors_io.errors import path_text
 from sensors_io.fields.sources import read_picture, read_pictures
 
 SIM2REAL = "gelsight_sim2real/quantitative_real_gan"
@@ -145,9 +146,9 @@ def load(path: pathlib.Path, frame: int = 0) -> np.ndarray:
     Raises:
       ValueError: a file that OpenCV cannot read.
     """
-    picture = cv2.imread(str(path))
+    picture = cv2.imread(path_text(path))
     if picture is None:
-        reader = cv2.VideoCapture(str(path))
+        reader = cv2.VideoCapture(path_text(path))
         for _ in range(frame + 1):
             _, picture = reader.read()
         reader.release()

@@ -42,8 +42,10 @@ class Export:
         for name, target in (("fps", "lerobot"), ("points", "ply")):
             if getattr(self, name) and self.to != target:
                 raise ExportError(f"--{name} is of --to {target}, --to is {self.to}: leave it out")
-        if self.fps < 0:
-            raise ExportError(f"--fps is {self.fps}: must be > 0, or 0 for that of the first contact; correct it")
+        if not 0 <= self.fps <= 10_000:
+            raise ExportError(
+                f"--fps is {self.fps}: must lie in 1 … 10,000, or 0 for that of the first contact; correct it"
+            )
         if self.to == "ply" and self.records.suffix == ".npz":
             count = ply_of_file(self.records, self.out, self.points)
             OUT.print(f"wrote {count} surfaces to {self.out}", highlight=False)

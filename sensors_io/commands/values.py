@@ -4,6 +4,8 @@ import dataclasses
 import pathlib
 from typing import Any
 
+from sensors_io.errors import UserError, path_text
+
 PORTS = 65_535
 
 MOST = 1e15
@@ -30,6 +32,11 @@ def require_possible(value: Any, where: str = "") -> None:
             require_possible(each, where)
     elif isinstance(value, pathlib.Path) and value.exists() and not (value.is_file() or value.is_dir()):
         raise ValueError(f"{where} is {value}: must be a file or a folder, not a pipe or a device; save what it gives")
+    elif isinstance(value, pathlib.Path):
+        try:
+            path_text(value)
+        except UserError as error:
+            raise ValueError(f"{where}: {error}") from error
     elif isinstance(value, float) and not abs(value) <= MOST:
         raise ValueError(f"{where} is {value}: must be a number within ±{MOST:g}; correct it")
     elif isinstance(value, int) and where.endswith("port") and not 0 <= value <= PORTS:

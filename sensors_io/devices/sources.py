@@ -13,6 +13,7 @@ from sensors_io.clock import NS_PER_S
 from sensors_io.devices import tac3d_messages
 from sensors_io.devices.base import Identity
 from sensors_io.devices.errors import DeviceNotFoundError
+from sensors_io.errors import path_text
 from sensors_io.records import RecordStore
 from sensors_io.schema import FRAME_ARRAYS, Sequence
 
@@ -112,7 +113,7 @@ class VideoFile:
             capture.release()
 
     def _open(self) -> cv2.VideoCapture:
-        capture = cv2.VideoCapture(str(self.path))
+        capture = cv2.VideoCapture(path_text(self.path))
         if not capture.isOpened():
             raise DeviceNotFoundError(f"{self.path} does not open as a video; give another file")
         return capture
@@ -188,10 +189,10 @@ class Tac3dRecording:
 
 def _read_picture(path: pathlib.Path) -> np.ndarray:
     """RGB uint8, or the counts of a depth camera, uint16."""
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    image = cv2.imread(path_text(path), cv2.IMREAD_UNCHANGED)
     if image is not None and image.ndim == 2 and image.dtype == np.uint16:
         return image
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    image = cv2.imread(path_text(path), cv2.IMREAD_COLOR)
     if image is None:
         raise DeviceNotFoundError(f"{path} cannot be decoded as a picture; take it out of the folder")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)

@@ -8,6 +8,7 @@
 Both libraries compress without loss; arrays have the types and units of `schema.FRAME_ARRAYS`.
 """
 
+import contextlib
 import pathlib
 from collections.abc import Callable, Iterator
 from typing import Any, Literal
@@ -15,26 +16,25 @@ from typing import Any, Literal
 import numpy as np
 
 from sensors_io.contents import RESTS, rest_pictures
-from sensors_io.errors import MALFORMED, UserError
 from sensors_io.exporters.selection import (
-    ExportError,
+    VIEWS,
+    FoundExport,
     Progress,
     Selected,
     card_of,
     card_text,
+    head_of,
+    head_text,
     library,
-    meta_of,
-    meta_text,
     published,
     sequence_of,
     sequence_text,
-    write_back,
 )
 from sensors_io.schema import FRAME_ARRAYS, ObjectCard, Sequence
 
 Kind = Literal["zarr", "hdf5"]
 
-_META, _PLAIN, _VIEWS = "touchr1", "plain", ("view", "view_depth_mm")
+_HEAD, _PLAIN = "touchr1", "plain"
 
 
 def export_arrays(selected: Selected, out: pathlib.Path, kind: Kind, progress: Progress) -> None:
@@ -46,11 +46,11 @@ def export_arrays(selected: Selected, out: pathlib.Path, kind: Kind, progress: P
     with published(out) as temporary:
         root, put, close = _created(temporary, kind)
         try:
-            root.attrs[_META] = meta_text(selected.meta)
+            root.attrs[_HEAD] = head_text(selected)
             for number, card in enumerate(selected.cards()):
                 group = root.create_group(f"objects/{number:06d}")
                 group.attrs[_PLAIN] = card_text(card)
-                _put_all(group, put, {name: getattr(card, name) for name in _VIEWS})
+                _put_all(group, put, {name: getattr(card, name) for name in VIEWS})
             rests = root.create_group(RESTS)
             _put_all(rests, put, {n: np.frombuffer(x, np.uint8) for n, x in rest_pictures(selected.store.path).items()})
             for number, contact in selected.contacts(progress):
@@ -62,38 +62,28 @@ def export_arrays(selected: Selected, out: pathlib.Path, kind: Kind, progress: P
             close()
 
 
-def import_arrays(path: pathlib.Path, out: pathlib.Path, progress: Progress) -> None:
-    """Write the records that `export_arrays` wrote to `path`.
+@contextlib.contextmanager
+def read_arrays(path: pathlib.Path) -> Iterator[FoundExport]:
+    """What `export_arrays` wrote to `path`; damaged parts raise errors of the libraries.
 
     Raises:
-      ExportError: it is no such export, it is damaged, or the library is not installed.
-      RecordsExistError: `out` holds other records.
+      ExportError: an export of another version, or the library is not installed.
     """
-    root, close = _opened(path)
-    try:
-        meta = meta_of(str(root.attrs[_META]), path)
-        numbers, done = sorted(root["contacts"]), 0
-
-        def one_more() -> None:
-            nonlocal done
-            done += 1
-            progress(done, len(numbers))
-
-        contacts = (_contact(root["contacts"][number], meta.sensors) for number in numbers)
-        rests = {name: root[RESTS][name][...].tobytes() for name in root[RESTS]}
-        write_back(meta, _cards(root), contacts, rests, out, one_more)
-    except UserError:
-        raise
-    except MALFORMED as error:
-        raise ExportError(f"{path} is no export of records, or damaged ({error!r}); export them again") from error
-    finally:
-        close()
+    with _opened(path) as root:
+        head, numbers = head_of(str(root.attrs[_HEAD]), path), sorted(root["contacts"])
+        yield FoundExport(
+            head=head,
+            cards=list(_cards(root)),
+            rests={name: root[RESTS][name][...].tobytes() for name in root[RESTS]},
+            count=len(numbers),
+            contacts=(_contact(root["contacts"][number], head.meta.sensors) for number in numbers),
+        )
 
 
 def _cards(root: Any) -> Iterator[ObjectCard]:
     for name in sorted(root["objects"]):
         group = root["objects"][name]
-        yield card_of(str(group.attrs[_PLAIN]), {view: group[view][...] for view in _VIEWS if view in group})
+        yield card_of(str(group.attrs[_PLAIN]), {view: group[view][...] for view in VIEWS if view in group})
 
 
 def _contact(group: Any, sensors: tuple[str, ...]) -> list[Sequence]:
@@ -123,14 +113,11 @@ def _created(path: pathlib.Path, kind: Kind) -> tuple[Any, Callable[[Any, str, n
     return file, lambda group, name, x: group.create_dataset(name, data=x, **squeezed if x.ndim else {}), file.close
 
 
-def _opened(path: pathlib.Path) -> tuple[Any, Callable[[], Any]]:
-    """A tree to read, and the function that closes it."""
-    try:
-        if path.is_dir():
-            return library("zarr", "zarr").open_group(store=str(path), mode="r"), lambda: None
-        file = library("h5py", "hdf5").File(path, "r")
-    except ExportError:
-        raise
-    except (OSError, *MALFORMED) as error:
-        raise ExportError(f"{path} does not open as Zarr or HDF5 ({error!r}); export the records again") from error
-    return file, file.close
+@contextlib.contextmanager
+def _opened(path: pathlib.Path) -> Iterator[Any]:
+    """A tree to read."""
+    if path.is_dir():
+        yield library("zarr", "zarr").open_group(store=str(path), mode="r")
+        return
+    with library("h5py", "hdf5").File(path, "r") as file:
+        yield file

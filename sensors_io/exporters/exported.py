@@ -1,10 +1,11 @@
 """Records back from an export, whichever format it has."""
 
+import contextlib
 import pathlib
 
-from sensors_io.exporters.arrays import import_arrays
-from sensors_io.exporters.lerobot import OURS, import_lerobot
-from sensors_io.exporters.selection import ExportError, Progress
+from sensors_io.exporters.arrays import read_arrays
+from sensors_io.exporters.lerobot import OURS, read_lerobot
+from sensors_io.exporters.selection import ExportError, Progress, damage_named, write_back
 
 
 def import_exported(path: pathlib.Path, out: pathlib.Path, progress: Progress) -> None:
@@ -21,7 +22,10 @@ def import_exported(path: pathlib.Path, out: pathlib.Path, progress: Progress) -
     """
     if not path.exists():
         raise ExportError(f"{path} does not exist: must be a folder or file that `export` wrote; correct the path")
-    if (path / OURS).is_dir():
-        import_lerobot(path, out, progress)
-    else:
-        import_arrays(path, out, progress)
+    if out.resolve() == path.resolve():
+        raise ExportError(f"--out is {out}, the export itself: must be another folder; name one")
+    with contextlib.ExitStack() as stack:
+        with damage_named(path):
+            lerobot = (path / OURS).is_dir()
+            found = read_lerobot(path) if lerobot else stack.enter_context(read_arrays(path))
+        write_back(path, found, out, progress)

@@ -20,18 +20,17 @@ import numpy as np
 
 from sensors_io.codec import decode_card, encode_card
 from sensors_io.contents import put_rest_pictures, rest_pictures
-from sensors_io.errors import MALFORMED, UserError
 from sensors_io.exporters.lerobot_files import EpisodeFiles, EpisodeReader, feature, write_table
 from sensors_io.exporters.selection import (
     ExportError,
+    FoundExport,
     Progress,
     Selected,
-    meta_of,
-    meta_text,
+    head_of,
+    head_text,
     published,
     sequence_of,
     sequence_text,
-    write_back,
 )
 from sensors_io.schema import FRAME_ARRAYS, Sequence
 
@@ -77,41 +76,29 @@ def export_lerobot(selected: Selected, out: pathlib.Path, fps: int, progress: Pr
         cards = [{"object_id": card.object_id, "card": encode_card(card)} for card in selected.cards()]
         write_table(temporary / OURS / "objects.parquet", cards)
         put_rest_pictures(temporary / OURS, rest_pictures(selected.store.path))
-        (temporary / OURS / "records.json").write_text(meta_text(selected.meta))
+        (temporary / OURS / "records.json").write_text(head_text(selected))
 
 
-def import_lerobot(path: pathlib.Path, out: pathlib.Path, progress: Progress) -> None:
-    """Write the records that `export_lerobot` wrote to `path`.
+def read_lerobot(path: pathlib.Path) -> FoundExport:
+    """What `export_lerobot` wrote to `path`; damaged parts raise errors of the libraries.
 
     Raises:
-      ExportError: it is no such export, it is damaged, or a library is not installed.
-      RecordsExistError: `out` holds other records.
+      ExportError: an export of another version, or a library is not installed.
     """
-    try:
-        meta = meta_of((path / OURS / "records.json").read_text(), path)
-        reading = EpisodeReader(path)
-        cards = [decode_card(row["card"]) for row in reading.table(f"{OURS}/objects.parquet")]
-        plain = collections.defaultdict(list)
-        for row in reading.table(f"{OURS}/sequences.parquet"):
-            plain[row["episode_index"]].append((row["sensor"], row["plain"]))
-        done = 0
-
-        def one_more() -> None:
-            nonlocal done
-            done += 1
-            progress(done, len(plain))
-
-        contacts = (
+    head, reading = head_of((path / OURS / "records.json").read_text(), path), EpisodeReader(path)
+    plain = collections.defaultdict(list)
+    for row in reading.table(f"{OURS}/sequences.parquet"):
+        plain[row["episode_index"]].append((row["sensor"], row["plain"]))
+    return FoundExport(
+        head=head,
+        cards=[decode_card(row["card"]) for row in reading.table(f"{OURS}/objects.parquet")],
+        rests=rest_pictures(path / OURS),
+        count=len(plain),
+        contacts=(
             [_sequence(sensor, text, columns) for sensor, text in plain[episode]]
             for episode, columns in enumerate(reading.episodes())
-        )
-        write_back(meta, cards, contacts, rest_pictures(path / OURS), out, one_more)
-    except UserError:
-        raise
-    except (OSError, *MALFORMED) as error:
-        raise ExportError(
-            f"{path} is no LeRobotDataset that `export` wrote, or damaged ({error!r}); export the records again"
-        ) from error
+        ),
+    )
 
 
 def _columns(contact: Contact) -> dict[str, np.ndarray]:

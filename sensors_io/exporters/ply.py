@@ -52,15 +52,18 @@ def ply_of_file(path: pathlib.Path, out: pathlib.Path, points: bool) -> int:
     """
     try:
         file = load_arrays(path)
-        depth, pitch, names = file["depth_mm"], float(file["mm_per_px"]), file["names"].tolist()
+        depth, pitch, names = file["depth_mm"], float(file["mm_per_px"]), file["names"]
+        stems = [pathlib.PurePosixPath(str(name).replace("\0", "_")).stem for name in names]
+        if depth.ndim != 3 or len(stems) != len(depth) or not pitch > 0:
+            raise ValueError(f"depth_mm {list(depth.shape)}, {len(stems)} names, {pitch:g} mm per px")
+        finite = bool(np.isfinite(depth.astype(np.float32)).all())
     except (OSError, *MALFORMED) as error:
         raise ExportError(f"{path} is no file of `extract` ({error!r}); extract the pictures again") from error
-    if not np.isfinite(depth).all():
+    if not finite or not depth.size:
         raise ExportError(f"{path} holds no depth: must be extracted with a calibration; give --calibration there")
     with published(out) as temporary:
         temporary.mkdir()
-        for n, one in enumerate(depth):
-            stem = pathlib.PurePosixPath(str(names[n])).stem
+        for n, (one, stem) in enumerate(zip(depth, stems, strict=True)):
             (temporary / f"{n:05d}-{stem}.ply").write_bytes(surface(one, pitch, None, points))
     return len(depth)
 

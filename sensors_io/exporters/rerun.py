@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from sensors_io.exporters.selection import Progress, Selected, library, published
+from sensors_io.exporters.selection import ExportError, Progress, Selected, library, published
 from sensors_io.schema import Flag, Phase, Sequence
 
 _ARROWS = 16
@@ -24,7 +24,10 @@ def export_rerun(selected: Selected, out: pathlib.Path, progress: Progress) -> N
     rr = library("rerun", "rerun")
     with published(out) as temporary:
         log = rr.RecordingStream("touchr1")
-        log.save(str(temporary))
+        try:
+            log.save(str(temporary))
+        except RuntimeError as error:
+            raise ExportError(f"--out is {out}: cannot be written ({error}); name another path") from error
         for number, contact in selected.contacts(progress):
             key = next(iter(contact.values())).key
             card = selected.store.objects[key.object_id]

@@ -1,4 +1,8 @@
-"""Contacts of records that are exported, and what of them JSON can say."""
+"""Contacts of records that are exported, and what of them JSON can say.
+
+The libraries that write exports find no flipped bit, and read an array that is missing as zeros; so the JSON of each
+part states the checksum of its arrays, and that of the whole the number of sequences.
+"""
 
 import contextlib
 import dataclasses
@@ -8,12 +12,16 @@ import json
 import os
 import pathlib
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, TypeVar
 
-from sensors_io.contents import put_rest_pictures
-from sensors_io.errors import UserError
+import numpy as np
+
+from sensors_io.contents import put_rest_pictures, rest_pictures
+from sensors_io.errors import MALFORMED, UserError
 from sensors_io.index import RecordsMeta
+from sensors_io.json_files import seal, unseal
 from sensors_io.records import RecordStore, RecordWriter
 from sensors_io.schema import FRAME_ARRAYS, ContactKey, ObjectCard, Sequence
 
@@ -21,6 +29,14 @@ FORMAT = "touchr1-export"
 """Says in every export that can be imported again what it is."""
 
 SEQUENCE_PLAIN = ("sensor", "serial", "calibration", "camera", "contact_region_px", "mm_per_px")
+ARRAYS = "arrays"
+"""Key of the checksum of a part's arrays; exports of earlier versions have none."""
+
+UNREADABLE = (*MALFORMED, OSError, RuntimeError, EOFError, zlib.error)
+"""What h5py, zarr, pyarrow and PyAV raise for damaged files."""
+
+_T = TypeVar("_T")
+VIEWS = ("view", "view_depth_mm")
 _CARD_PLAIN = ("object_id", "split", "labels", "annotator", "visual_lies", "truth", "name")
 
 Progress = Callable[[int, int], None]
@@ -53,6 +69,10 @@ class Selected:
         if wrong:
             raise ExportError(f"sensors is {', '.join(wrong)}: must be of {', '.join(have)}; correct it")
         outside = [row for row in self.rows if not 0 <= row < len(self.store)]
+        if len(set(self.rows)) < len(self.rows):
+            raise ExportError(
+                f"contacts is {list(self.rows)}: must name each contact once; leave out what is named again"
+            )
         if outside or not len(self.store):
             raise ExportError(
                 f"contacts is {outside or 'empty'}: must lie in 0..{len(self.store) - 1}; `list` shows the records"
@@ -90,66 +110,156 @@ class Selected:
 def sequence_text(sequence: Sequence) -> str:
     """A sequence without its arrays, as JSON."""
     plain = {name: getattr(sequence, name) for name in SEQUENCE_PLAIN} | {"key": dataclasses.asdict(sequence.key)}
-    return json.dumps(plain)
+    return seal(json.dumps(plain | {ARRAYS: _checksum({name: getattr(sequence, name) for name in FRAME_ARRAYS})}))
 
 
 def sequence_of(text: str, arrays: Mapping[str, Any]) -> Sequence:
-    """The sequence that `sequence_text` and its arrays describe."""
-    plain = json.loads(text)
-    region = plain["contact_region_px"]
-    plain |= {"key": ContactKey(**plain["key"]), "contact_region_px": None if region is None else tuple(region)}
-    return Sequence(**plain, **{name: arrays[name] for name in FRAME_ARRAYS if name in arrays})
+    """The sequence that `sequence_text` and its arrays describe.
+
+    Raises:
+      ExportError: the arrays are others than were exported.
+    """
+    plain, own = unseal(text), {name: arrays[name] for name in FRAME_ARRAYS if name in arrays}
+    key, region = ContactKey(**plain["key"]), plain["contact_region_px"]
+    _require_same(plain, own, f"{key} by {plain['sensor']}")
+    plain |= {"key": key, "contact_region_px": None if region is None else tuple(region)}
+    return Sequence(**plain, **own)
 
 
 def card_text(card: ObjectCard) -> str:
     """A card without its view, as JSON."""
     plain = {name: getattr(card, name) for name in _CARD_PLAIN}
-    return json.dumps(plain | {"labels": dict(card.labels), "truth": dict(card.truth)})
+    plain |= {"labels": dict(card.labels), "truth": dict(card.truth)}
+    return seal(json.dumps(plain | {ARRAYS: _checksum({name: getattr(card, name) for name in VIEWS})}))
 
 
 def card_of(text: str, arrays: Mapping[str, Any]) -> ObjectCard:
-    """The card that `card_text` and its view describe."""
-    return ObjectCard(**json.loads(text), view=arrays.get("view"), view_depth_mm=arrays.get("view_depth_mm"))
+    """The card that `card_text` and its view describe.
+
+    Raises:
+      ExportError: the view is another than was exported.
+    """
+    plain, own = unseal(text), {name: arrays[name] for name in VIEWS if name in arrays}
+    _require_same(plain, own, f"object {plain['object_id']}")
+    return ObjectCard(**plain, **own)
 
 
-def meta_text(meta: RecordsMeta) -> str:
+def _checksum(arrays: Mapping[str, Any]) -> int:
+    """CRC-32 of the names, types, shapes and values of the arrays that are not `None`."""
+    crc = 0
+    for name, array in sorted(arrays.items()):
+        if array is not None:
+            crc = zlib.crc32(f"{name} {array.dtype.str} {array.shape} ".encode(), crc)
+            crc = zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data, crc)
+    return crc
+
+
+def _require_same(plain: dict[str, Any], arrays: Mapping[str, Any], what: str) -> None:
+    if plain.pop(ARRAYS, None) not in (None, _checksum(arrays)):
+        raise ExportError(
+            f"{what}: its arrays are not those that were exported; export the records again, or, if the change is "
+            f"meant, remove {ARRAYS!r} and 'crc32' from its JSON"
+        )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ExportHead:
+    """What an export says of itself.
+
+    Args:
+      meta: of the records.
+      sequences: their number; `None` in exports of earlier versions.
+      rests: name → CRC-32 of the pictures of gels at rest; empty in exports of earlier versions.
+    """
+
+    meta: RecordsMeta
+    sequences: int | None
+    rests: Mapping[str, int]
+
+
+def head_text(selected: Selected) -> str:
     """Description of the records and of the format, as JSON."""
-    return json.dumps({"format": FORMAT, "version": 1, "meta": dataclasses.asdict(meta)})
+    sensors, store = set(selected.meta.sensors), selected.store
+    rests = {name: zlib.crc32(data) for name, data in rest_pictures(store.path).items()}
+    counted = {"sequences": sum(len(sensors & set(store.sensors_of(i))) for i in selected.numbers), "rests": rests}
+    return seal(json.dumps({"format": FORMAT, "version": 1, "meta": dataclasses.asdict(selected.meta), **counted}))
 
 
-def meta_of(text: str, where: object) -> RecordsMeta:
-    """The description that `meta_text` wrote.
+def head_of(text: str, where: object) -> ExportHead:
+    """The description that `head_text` wrote.
 
     Raises:
       ExportError: an export of another version, or of another program.
     """
-    tree = json.loads(text)
+    tree = unseal(text)
     if (tree.get("format"), tree.get("version")) != (FORMAT, 1):
         raise ExportError(
             f"{where} is {tree.get('format')!r} version {tree.get('version')!r}, this code reads {FORMAT!r} version 1; "
             "export the records again"
         )
-    return RecordsMeta(**tree["meta"] | {"sensors": tuple(tree["meta"]["sensors"])})
+    meta = RecordsMeta(**tree["meta"] | {"sensors": tuple(tree["meta"]["sensors"])})
+    return ExportHead(meta=meta, sequences=tree.get("sequences"), rests=tree.get("rests", {}))
 
 
-def write_back(
-    meta: RecordsMeta,
-    cards: Iterable[ObjectCard],
-    contacts: Iterable[list[Sequence]],
-    rests: Mapping[str, bytes],
-    out: pathlib.Path,
-    progress: Callable[[], object],
-) -> None:
-    """Write what an export holds as records; an interrupted import goes on behind the contacts that are there."""
-    with RecordWriter(out, meta=meta, resume=True) as writer:
-        put_rest_pictures(out, rests)
-        for card in cards:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FoundExport:
+    """An opened export: its description, cards and gels at rest, its contacts one after the other, and their number."""
+
+    head: ExportHead
+    cards: list[ObjectCard]
+    rests: Mapping[str, bytes]
+    count: int
+    contacts: Iterator[list[Sequence]]
+
+
+@contextlib.contextmanager
+def damage_named(path: pathlib.Path) -> Iterator[None]:
+    """Errors of the libraries that read an export become one that names it.
+
+    Raises:
+      ExportError: it is no export, or damaged.
+    """
+    try:
+        yield
+    except UserError:
+        raise
+    except UNREADABLE as error:
+        raise ExportError(f"{path} is no export of records, or damaged ({error!r}); export them again") from error
+
+
+def write_back(path: pathlib.Path, found: FoundExport, out: pathlib.Path, progress: Progress) -> None:
+    """Write what an export holds as records; an interrupted import goes on behind the contacts that are there.
+
+    Raises:
+      ExportError: a part of it is damaged or missing.
+      RecordsExistError: `out` holds other records.
+    """
+    differ = {
+        name for name, data in found.rests.items() if found.head.rests.get(name, zlib.crc32(data)) != zlib.crc32(data)
+    }
+    if lost := sorted(differ | (found.head.rests.keys() - found.rests.keys())):
+        raise ExportError(f"{path}: the gel at rest in {lost[0]} is missing or damaged; export the records again")
+    sequences = 0
+    with RecordWriter(out, meta=found.head.meta, resume=True) as writer:
+        put_rest_pictures(out, found.rests)
+        for card in found.cards:
             if card.object_id not in writer.objects_done:
                 writer.write_object(card)
-        for sequences in contacts:
-            if sequences[0].key not in writer:
-                writer.write_contact(sequences)
-            progress()
+        for done, contact in enumerate(_read(path, found.contacts), 1):
+            if not contact:
+                raise ExportError(f"{path}: contact {done} holds no sequence; export the records again")
+            if contact[0].key not in writer:
+                writer.write_contact(contact)
+            sequences += len(contact)
+            progress(done, found.count)
+        if found.head.sequences not in (None, sequences):
+            raise ExportError(f"{path} holds {sequences} of {found.head.sequences} sequences; export the records again")
+
+
+def _read(path: pathlib.Path, parts: Iterator[_T]) -> Iterator[_T]:
+    """Each part of an export; errors of writing the records are not raised in here."""
+    with damage_named(path):
+        yield from parts
 
 
 def library(name: str, extra: str) -> Any:

@@ -53,6 +53,7 @@ def list_hdf5(source: pathlib.Path, config: HDF5Config) -> Catalogue:
     skipped: list[Skip] = []
     contacts: dict[ContactKey, Listed] = {}
     cards: dict[str, ObjectCard] = {}
+    trials: dict[ContactKey, int] = {}  # the next one of those that a layout does not number
     for path in files:
         try:
             with opened(path) as file:
@@ -65,8 +66,10 @@ def list_hdf5(source: pathlib.Path, config: HDF5Config) -> Catalogue:
             if cards.setdefault(key.object_id, card) != card:
                 skipped.append(Skip(name=place.name, reason=f"labels object {key.object_id!r} unlike an earlier one"))
                 continue
-            while key in contacts:  # a layout that numbers no trials
-                key = dataclasses.replace(key, trial=key.trial + 1)
+            stated = key
+            while key in contacts:
+                key = dataclasses.replace(stated, trial=max(trials.get(stated, 0), key.trial + 1))
+            trials[stated] = key.trial + 1
             read = functools.partial(read_contact, place, key, layout, config)
             contacts[key] = Listed(key=key, name=place.name, read=read)
     if not contacts and not skipped:

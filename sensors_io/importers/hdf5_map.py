@@ -26,7 +26,7 @@ import pathlib
 from collections.abc import Mapping
 from typing import Any
 
-from sensors_io.importers.keep import ImportSourceError
+from sensors_io.importers.keep import LEAST_HZ, MOST_HZ, ImportSourceError
 from sensors_io.schema import ATTRIBUTES
 
 UNITS: Mapping[str, Mapping[str, float]] = {
@@ -222,11 +222,11 @@ def _stream(entry: _Entry) -> StreamMap:
         raise ImportSourceError(f"{entry.name} has no frames, depth_mm or deformation_mm: needs one of them; add it")
     if "host_time_ns" in arrays and rate is None:
         return StreamMap(arrays=arrays, rate_hz=None)
-    stated = isinstance(rate, (int, float)) and not isinstance(rate, bool) and 0 < rate < 1e6
+    stated = isinstance(rate, (int, float)) and not isinstance(rate, bool) and LEAST_HZ <= rate <= MOST_HZ
     if "host_time_ns" in arrays or rate is None or not stated:
         raise ImportSourceError(
-            f"{entry.name}: rate_hz is {rate!r}: must be above 0 where no host_time_ns is named, and absent otherwise; "
-            "give one of them"
+            f"{entry.name}: rate_hz is {rate!r}: must lie in {LEAST_HZ:g} … {MOST_HZ:g} where no host_time_ns is "
+            "named, and absent otherwise; give one of them"
         )
     return StreamMap(arrays=arrays, rate_hz=float(rate))
 

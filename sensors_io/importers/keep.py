@@ -7,6 +7,12 @@ import numpy as np
 
 from sensors_io.errors import UserError
 
+HIGHEST = 16_384
+"""Rows of a stored picture."""
+
+LEAST_HZ, MOST_HZ = 1e-3, 1e6
+"""Frame rates; at others, times are beyond 64 bits or all the same."""
+
 WIDEST = 100
 """Columns for each row of a picture that is brought to a number of rows."""
 
@@ -49,6 +55,8 @@ class Keep:
         for name, least in (("height", 0), ("stride", 1), ("max_frames", 0)):
             if getattr(self, name) < least:
                 raise ImportSourceError(f"{name} is {getattr(self, name)}: must be ≥ {least}; raise it")
+        if self.height > HIGHEST:
+            raise ImportSourceError(f"height is {self.height}: must be ≤ {HIGHEST} rows; lower it")
 
     def positions(self, total: int) -> np.ndarray:
         """Positions of the frames that are kept of `total`, int64, ascending."""

@@ -76,8 +76,10 @@ def read_labels(path: pathlib.Path, key: str, columns: Seq[str] = COLUMNS) -> di
         raise LabelsError(
             f"{path} cannot be read as a CSV table ({error}); write one with {', '.join((key, *others))}"
         ) from error
-    if key not in found or set(found) - set(columns):
-        raise LabelsError(f"{path}: columns are {found}: must be {key} and any of {tuple(others)}; rename or drop them")
+    if key not in found or set(found) - set(columns) or len(set(found)) < len(found):
+        raise LabelsError(
+            f"{path}: columns are {found}: must be {key} and any of {tuple(others)}, each once; rename or drop them"
+        )
     rows: dict[str, LabelRow] = {}
     for number, line in enumerate(lines, start=2):
         place = f"{path}, line {number}"

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import math
 import pathlib
 from collections.abc import Iterator
 from typing import Any
@@ -10,7 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sensors_io.importers.keep import Keep, UnreadableError
+from sensors_io.errors import UserError, path_text
+from sensors_io.importers.keep import LEAST_HZ, MOST_HZ, Keep, UnreadableError
 
 _MOST_STATED = 10**6  # frames that a header is believed
 
@@ -54,7 +54,7 @@ def read_video(path: pathlib.Path, keep: Keep) -> VideoFrames:
     """
     with _opened(path) as capture:
         rate_hz, stated = capture.get(cv2.CAP_PROP_FPS), int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        if not (math.isfinite(rate_hz) and rate_hz > 0):
+        if not LEAST_HZ <= rate_hz <= MOST_HZ:
             raise VideoError(f"states a frame rate of {rate_hz}")
         expected = min(max(stated, 0), _MOST_STATED)
         frames, total, size_px = _decode(capture, keep, keep.positions(expected))
@@ -72,7 +72,10 @@ def read_video(path: pathlib.Path, keep: Keep) -> VideoFrames:
 
 @contextlib.contextmanager
 def _opened(path: pathlib.Path) -> Iterator[cv2.VideoCapture]:
-    capture = cv2.VideoCapture(str(path))
+    try:
+        capture = cv2.VideoCapture(path_text(path))
+    except UserError as error:
+        raise VideoError("has a name that is not UTF-8; rename it") from error
     try:
         if not capture.isOpened():
             raise VideoError("does not open as a video")

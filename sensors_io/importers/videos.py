@@ -21,7 +21,7 @@ import numpy as np
 
 from sensors_io.importers.catalogue import Catalogue, Listed, Taken, fingerprint, require_files
 from sensors_io.importers.holdout import split_by_name
-from sensors_io.importers.keep import ImportConfig, ImportSourceError, Skip
+from sensors_io.importers.keep import LEAST_HZ, MOST_HZ, ImportConfig, ImportSourceError, Skip
 from sensors_io.importers.label_table import COLUMNS, ID, NAME, SPLIT, LabelRow, LabelsError, read_labels
 from sensors_io.importers.pictures import film, natural, nominal_ns, numbered, read_pictures
 from sensors_io.importers.video import read_video
@@ -54,8 +54,10 @@ class VideosConfig(ImportConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.rate_hz > 0:
-            raise ImportSourceError(f"rate_hz is {self.rate_hz}: must be > 0; give the frame rate of the pictures")
+        if not LEAST_HZ <= self.rate_hz <= MOST_HZ:
+            raise ImportSourceError(
+                f"rate_hz is {self.rate_hz}: must lie in {LEAST_HZ:g} … {MOST_HZ:g}; give that of the pictures"
+            )
 
 
 def list_videos(source: pathlib.Path, config: VideosConfig) -> Catalogue:
@@ -71,7 +73,13 @@ def list_videos(source: pathlib.Path, config: VideosConfig) -> Catalogue:
     require_files(source, clips, f"videos ({', '.join(SUFFIXES)}) or folders of pictures")
     named = {(p.relative_to(source).as_posix() if p != source else p.resolve().name): p for p in clips}
     rows = {} if config.labels is None else read_labels(config.labels, CLIP, (CLIP, *COLUMNS))
-    row_of = {_find(name, row, named, source): row for name, row in rows.items()}
+    if config.labels is not None and not rows:
+        raise LabelsError(f"{config.labels} has no row: must list clips; complete it, or leave --labels out")
+    by_name: dict[str, list[str]] = {}
+    for clip in named:
+        for known in {clip, _plain(clip)}:
+            by_name.setdefault(known, []).append(clip)
+    row_of = {_find(name, row, by_name, source): row for name, row in rows.items()}
     cards = _cards(row_of, list(named), config)
     contacts, trials = [], Counter[str]()
     for name, path in named.items():
@@ -109,14 +117,13 @@ def _clips(source: pathlib.Path) -> list[pathlib.Path]:
     return [p for p in (*inside, source) if (p.is_file() and p.suffix.lower() in SUFFIXES) or numbered(p)]
 
 
-def _find(name: str, row: LabelRow, named: Mapping[str, pathlib.Path], source: pathlib.Path) -> str:
-    """The clip that a row names, with or without the ending of its file."""
-    wanted = name.strip("/")
-    found = [clip for clip in named if wanted in (clip, _plain(clip))]
+def _find(name: str, row: LabelRow, by_name: Mapping[str, Seq[str]], source: pathlib.Path) -> str:
+    """The clip that a row names; `by_name` has the clips of every name, with and without the ending of a file."""
+    found = by_name.get(name.strip("/"), ())
     if len(found) == 1:
         return found[0]
     state = f"stands for {' and '.join(found)}: must be one clip" if found else f"is no clip of {source}"
-    near = f", such as {next(iter(named))}" if not found else ""
+    near = f", such as {next(iter(by_name.values()))[0]}" if not found else ""
     raise LabelsError(f"{row.place}: {CLIP} is {name!r}: {state}; give its path in the folder{near}")
 
 

@@ -221,3 +221,9 @@ def test_kinds_that_are_not_installed_are_named():
     )
     assert isinstance(place("a/b:c"), pathlib.Path)
     assert isinstance(place("/a"), pathlib.Path)
+
+
+@pytest.mark.parametrize("size", ["much", "nan", "inf", "-1"])
+def test_a_size_of_the_cache_that_is_none_is_named(monkeypatch, size):
+    monkeypatch.setenv(remote.CACHE_GB, size)
+    refused(StoreError, f"TOUCHR1_CACHE_GB is '{size}': must be a number of gigabytes", lambda: Mirror("memory://x"))

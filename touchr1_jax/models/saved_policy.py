@@ -120,7 +120,10 @@ def save_policy(folder: Path, saved: SavedPolicy, *, precision: Precision = "flo
 
 @contextlib.contextmanager
 def published(folder: Path) -> Iterator[Path]:
-    """A new folder that takes the place of `folder` if the block ends without an error, and else vanishes."""
+    """A new folder that takes the place of `folder` if the block ends without an error, and else vanishes.
+
+    Until the new one is in place the old one stays, or is put back.
+    """
     unfinished, old = (folder.with_name(f".{folder.name}.{os.getpid()}{end}") for end in ("", ".old"))
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)
@@ -129,6 +132,10 @@ def published(folder: Path) -> Iterator[Path]:
         if folder.exists():
             folder.rename(old)
         unfinished.rename(folder)
+    except BaseException:
+        if old.exists() and not folder.exists():
+            old.rename(folder)
+        raise
     finally:
         for rest in (unfinished, old):
             shutil.rmtree(rest, ignore_errors=True)

@@ -108,6 +108,17 @@ def test_a_foreign_configuration_is_named(tmp_path, content):
         runs.newest(tmp_path / "coin", {}, finished=False)
 
 
+@pytest.mark.parametrize(
+    ("file", "content"),
+    [("results.json", "{}"), ("results.json", "1"), ("results.json", '{"verdict": 2}'), ("timing.json", "[]")],
+)
+def test_foreign_results_and_times_are_named(tmp_path, file, content):
+    (tmp_path / "config.json").write_text(FOREIGN % '{"commit": "a", "dirty": false}')
+    (tmp_path / file).write_text(content)
+    with pytest.raises(DamagedFileError, match=rf"{file} is not that of a run"):
+        runs.read_run(tmp_path)
+
+
 def test_a_run_is_named_by_path_stamp_or_experiment(tmp_path):
     directory = make_run(tmp_path, "20260101-000000")
     (tmp_path / "coin" / "latest").symlink_to(directory.name)

@@ -1,21 +1,30 @@
 """Records through Zarr, HDF5 and a LeRobotDataset and back: every array, time, label and card comes back equal."""
 
 import dataclasses
+import errno
 import functools
 import json
 import pathlib
+import shutil
 
 import numpy as np
 import pytest
 
 from sensors_io.codec import encode_card, encode_sequence
 from sensors_io.contents import put_rest_pictures, rest_pictures
+from sensors_io.errors import UserError
 from sensors_io.exporters import selection
 from sensors_io.exporters.arrays import export_arrays
 from sensors_io.exporters.exported import import_exported
 from sensors_io.exporters.lerobot import export_lerobot
 from sensors_io.exporters.selection import ExportError, Selected
-from sensors_io.records import RecordsExistError, RecordStore, RecordWriter
+from sensors_io.records import (
+    IncompleteRecordsError,
+    MissingIndexError,
+    RecordsExistError,
+    RecordStore,
+    RecordWriter,
+)
 from tests.sensors_io import fakes
 from tests.sensors_io.checks import refused
 
@@ -131,18 +140,75 @@ def test_what_cannot_be_exported_or_read_is_one_line(tmp_path, monkeypatch):
     store = RecordStore(records)
     refused(ExportError, "sensors is digit: must be of gelsight_mini", Selected, store=store, sensors=("digit",))
     refused(ExportError, r"contacts is \[3\]: must lie in 0..0", Selected, store=store, rows=(3,))
+    refused(ExportError, r"contacts is \[0, 0\]: must name each contact once", Selected, store=store, rows=(0, 0))
     read = functools.partial(import_exported, out=tmp_path / "back", progress=SILENT)
     refused(ExportError, "does not exist", read, tmp_path / "gone")
+    refused(ExportError, "the export itself", import_exported, records, records, SILENT)
     pytest.importorskip("h5py")
     export("hdf5", records, tmp_path / "a.h5")
     refused(ExportError, "must not exist yet", export, "hdf5", records, tmp_path / "a.h5")
     (tmp_path / "cut.h5").write_bytes((tmp_path / "a.h5").read_bytes()[:2000])
-    refused(ExportError, "does not open as Zarr or HDF5", read, tmp_path / "cut.h5")
+    refused(ExportError, "is no export of records, or damaged", read, tmp_path / "cut.h5")
     monkeypatch.setattr(selection, "FORMAT", "something")
     refused(ExportError, "this code reads 'something'", read, tmp_path / "a.h5")
     (tmp_path / "l" / "meta" / "touchr1").mkdir(parents=True)
-    refused(ExportError, "no LeRobotDataset that `export` wrote", read, tmp_path / "l")
+    refused(ExportError, "is no export of records, or damaged", read, tmp_path / "l")
     refused(ExportError, r"pip install 'touchr1-jax\[x\]'", selection.library, "no_such_package", "x")
+
+
+def damaged(path: pathlib.Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+def halved(path: pathlib.Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def emptied(contacts: pathlib.Path) -> None:
+    """Leave a contact without sequences."""
+    shutil.rmtree(contacts / "000001" / "tac3d")
+
+
+ARRAY = "contacts/000001/tac3d/force_n"
+
+
+@pytest.mark.parametrize(
+    ("kind", "part", "damage"),
+    [
+        ("zarr", f"{ARRAY}/c/0/0", damaged),
+        ("zarr", f"{ARRAY}/c/0/0", pathlib.Path.unlink),  # Zarr reads what is missing as zeros
+        ("zarr", ARRAY, shutil.rmtree),
+        ("zarr", "contacts/000001", shutil.rmtree),
+        ("zarr", "objects/000000/view_depth_mm/c/0/0", pathlib.Path.unlink),
+        ("zarr", "backgrounds/rest.png", shutil.rmtree),
+        ("zarr", "contacts", emptied),
+        ("lerobot", "videos/observation.images.gelsight_mini/chunk-000/file-000.mp4", halved),
+        ("lerobot", "videos/observation.images.gelsight_mini/chunk-000/file-000.mp4", damaged),
+        ("lerobot", "data/chunk-000/file-000.parquet", damaged),
+        ("lerobot", "meta/touchr1/sequences.parquet", halved),
+    ],
+)
+def test_a_damaged_or_missing_part_of_an_export_is_named(tmp_path, kind, part, damage):
+    pytest.importorskip(NEEDS[kind])
+    out = tmp_path / "out"
+    if kind == "zarr":
+        put_rest_pictures(fakes.write(tmp_path / "records", 2, sensors=("tac3d",)), {"rest.png": b"a picture"})
+    else:
+        fakes.write(tmp_path / "records", 2, sensors=("gelsight_mini",))
+    export(kind, tmp_path / "records", out)
+    damage(out / part)
+    refused(UserError, "export", import_exported, out, tmp_path / "back", SILENT)
+    refused((IncompleteRecordsError, MissingIndexError), "back", RecordStore, tmp_path / "back")
+
+
+def test_a_full_disk_is_no_damage_of_the_export(tmp_path, monkeypatch):
+    pytest.importorskip("h5py")
+    export("hdf5", fakes.write(tmp_path / "records", 2), tmp_path / "out")
+    full = OSError(errno.ENOSPC, "No space left on device")
+    monkeypatch.setattr(RecordWriter, "write_contact", lambda self, contact: (_ for _ in ()).throw(full))
+    refused(OSError, "No space left", import_exported, tmp_path / "out", tmp_path / "back", SILENT)
 
 
 def test_an_export_that_fails_leaves_nothing(tmp_path, monkeypatch):

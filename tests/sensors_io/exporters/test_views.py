@@ -208,3 +208,24 @@ def test_names_that_rerun_would_split_are_escaped(tmp_path):
         writer.write_contact([fakes.sequence(0, length=2, key=key)])
     export_rerun(Selected(store=RecordStore(tmp_path / "records")), tmp_path / "a.rrd", SILENT)
     assert (tmp_path / "a.rrd").stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"depth_mm": np.ones((2, 4), np.float32)},
+        {"depth_mm": np.array(["x"])},
+        {"depth_mm": np.ones((0, 4, 5), np.float32), "names": np.array([], str)},
+        {"names": np.array(["a"])},
+        {"names": np.array("a")},
+        {"mm_per_px": np.ones(3)},
+        {"mm_per_px": np.float64("nan")},
+        {"mm_per_px": np.float64(0)},
+    ],
+)
+def test_arrays_that_are_no_surfaces_are_one_line(tmp_path, changed, capsys):
+    whole = {"depth_mm": np.ones((2, 4, 5), np.float32), "mm_per_px": np.float64(0.1), "names": np.array(["a", "b"])}
+    np.savez(tmp_path / "d.npz", **whole | changed)
+    assert main.main(["export", str(tmp_path / "d.npz"), "--to", "ply", "--out", str(tmp_path / "p")]) == 1
+    assert "ExportError" in capsys.readouterr().err
+    assert not (tmp_path / "p").exists()

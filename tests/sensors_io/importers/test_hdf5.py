@@ -1,6 +1,7 @@
 """HDF5 files of four layouts become records whose arrays equal those that h5py reads."""
 
 import json
+import time
 
 import cv2
 import h5py
@@ -242,3 +243,15 @@ def test_a_proposal_needs_units_and_then_imports(tmp_path, capsys):
     write_map(tmp_path, whole)
     assert main(["import", "hdf5", str(tmp_path), "--map", str(path), "--out", str(tmp_path / "records")]) == 0
     assert len(RecordStore(tmp_path / "records")) == 3
+
+
+def test_contacts_of_one_object_without_numbers_are_numbered_in_linear_time(tmp_path):
+    count = 1_000
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for n in range(count):
+            file.create_group(f"trials/{n}").attrs["object"] = "mug"
+    config = HDF5Config(map=write_map(tmp_path, mapped(object_id={"attribute": "object"})), **WHOLE)
+    began = time.process_time()
+    catalogue = list_hdf5(tmp_path, config)
+    assert [listed.key.trial for listed in catalogue.contacts] == list(range(count))
+    assert time.process_time() - began < 2.0

@@ -1,7 +1,11 @@
 """Somebody's own clips become records with the labels of their table; what does not fit is named by file and line."""
 
+import os
+import shutil
+
 import pytest
 
+from sensors_io.importers.keep import ImportSourceError
 from sensors_io.importers.label_table import LabelsError
 from sensors_io.importers.videos import VideosConfig, list_videos
 from sensors_io.schema import MATERIALS
@@ -73,3 +77,28 @@ def test_a_folder_of_pictures_alone_is_a_clip(tmp_path):
         picture(tmp_path / "press" / f"{n}.png")
     _, store = imported(list_videos(tmp_path / "press", VideosConfig(sensor="digit")), tmp_path / "records")
     assert [key.object_id for key in store.contacts] == ["press"]
+
+
+def test_a_name_that_is_no_utf_8_is_named(tmp_path):
+    """OpenCV crashed on it; the other clip is imported."""
+    film(tmp_path / "a.avi")
+    shutil.copy(tmp_path / "a.avi", os.fsencode(tmp_path) + b"/\xff.avi")
+    report, store = imported(list_videos(tmp_path, VideosConfig(sensor="digit")), tmp_path / "records")
+    assert len(store) == 1
+    assert any("not UTF-8" in skip.reason for skip in report.skipped)
+
+
+@pytest.mark.parametrize("changed", [{"rate_hz": 1e-320}, {"rate_hz": 1e14}, {"height": 100_000}, {"height": 2**31}])
+def test_rates_and_heights_that_no_clip_has_are_refused(changed):
+    with pytest.raises(ImportSourceError, match=next(iter(changed))):
+        VideosConfig(sensor="digit", **changed)
+
+
+@pytest.mark.parametrize(
+    ("table", "said"), [("clip\n", "has no row"), ("clip,hardness,hardness\na,0,2\n", "each once")]
+)
+def test_a_table_that_labels_nothing_or_twice_is_refused(tmp_path, table, said):
+    film(tmp_path / "a.avi")
+    (tmp_path / "labels.csv").write_text(table)
+    with pytest.raises(LabelsError, match=said):
+        list_videos(tmp_path, VideosConfig(sensor="digit", labels=tmp_path / "labels.csv"))

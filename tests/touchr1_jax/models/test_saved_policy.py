@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -147,3 +148,18 @@ def test_what_is_no_policy_is_named(folder, message):
     DAMAGE[message](folder)
     with pytest.raises(PolicyError, match=message):
         load_policy(folder)
+
+
+def test_a_policy_that_cannot_be_replaced_stays(saved, folder, monkeypatch):
+    before, rename = {p.name: p.read_bytes() for p in folder.iterdir()}, Path.rename
+
+    def fails(self, target):
+        if Path(target) == folder and not self.name.endswith(".old"):
+            raise OSError("no rename")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", fails)
+    with pytest.raises(OSError, match="no rename"):
+        save_policy(folder, saved, precision="int8")
+    assert {p.name: p.read_bytes() for p in folder.iterdir()} == before
+    assert [p.name for p in folder.parent.iterdir()] == ["policy"]

@@ -2,6 +2,7 @@
 
 import logging
 import resource
+import sys
 from pathlib import Path
 
 import jax
@@ -169,7 +170,8 @@ class TestDamage:
             checkpoints.restore({"other": jnp.zeros(2)})
         assert sorted(p.name for p in stage.iterdir()) == ["1", "2"]
 
-    def test_a_full_disk_is_named_and_costs_no_older_checkpoint(self, stage):
+    def test_a_full_disk_is_named_and_costs_no_older_checkpoint(self, stage, monkeypatch):
+        monkeypatch.setattr(sys, "dont_write_bytecode", True)  # a module that is cut off breaks every later import
         limits = resource.getrlimit(resource.RLIMIT_FSIZE)
         resource.setrlimit(resource.RLIMIT_FSIZE, (600, limits[1]))
         try:

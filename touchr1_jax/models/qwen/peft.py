@@ -95,6 +95,8 @@ def read_lora(fields: Mapping[str, Any], where: Path) -> LoraConfig:
     Raises:
       ValueError: another kind of adapters.
     """
+    if not isinstance(fields, Mapping):
+        raise ValueError(f"{where} is {str(fields)[:40]!r}: must be a JSON object; copy it again")
     wanted = {"peft_type": "LORA", **REFUSED}
     odd = [name for name, value in wanted.items() if (fields.get(name, value) or None) != (value or None)]
     if odd:

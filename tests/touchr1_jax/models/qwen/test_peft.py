@@ -104,6 +104,12 @@ def test_other_kinds_of_adapters_are_named(folder, field, value, message):
         load_adapters(folder, CONFIG)
 
 
+def test_a_config_that_is_no_object_is_named(folder):
+    (folder / "adapter_config.json").write_text("[]")
+    with pytest.raises(ValueError, match="must be a JSON object"):
+        load_adapters(folder, CONFIG)
+
+
 def test_a_missing_file_is_named(folder):
     (folder / "adapter_model.safetensors").unlink()
     with pytest.raises(FileNotFoundError, match=r"adapter_model\.safetensors is no file"):
