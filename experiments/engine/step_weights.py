@@ -93,7 +93,8 @@ def measured(config: StepWeightsConfig, stage: str, layers: int) -> dict[str, fl
         depth = min(layers, model.vision.depth)
         of_layers = "full_layers" if isinstance(model.vision, QwenVisionConfig) else "deepstack_layers"
         named = tuple(i for i in getattr(model.vision, of_layers) if i < depth) or (0,)
-        vision = dataclasses.replace(model.vision, depth=depth, **{of_layers: named})
+        changed: dict[str, Any] = {"depth": depth, of_layers: named}
+        vision = dataclasses.replace(model.vision, **changed)
         decoder = dataclasses.replace(model.decoder, num_layers=layers)
         model = dataclasses.replace(model, decoder=decoder, vision=vision)
     began = time.process_time(), time.perf_counter()

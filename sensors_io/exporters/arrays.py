@@ -64,7 +64,7 @@ def export_arrays(selected: Selected, out: pathlib.Path, kind: Kind, progress: P
 
 @contextlib.contextmanager
 def read_arrays(path: pathlib.Path) -> Iterator[FoundExport]:
-    """What `export_arrays` wrote to `path`; damaged parts raise errors of the libraries.
+    """Open an export that `export_arrays` wrote to `path`; damaged parts raise errors of the libraries.
 
     Raises:
       ExportError: an export of another version, or the library is not installed.

@@ -80,7 +80,7 @@ def export_lerobot(selected: Selected, out: pathlib.Path, fps: int, progress: Pr
 
 
 def read_lerobot(path: pathlib.Path) -> FoundExport:
-    """What `export_lerobot` wrote to `path`; damaged parts raise errors of the libraries.
+    """Open an export that `export_lerobot` wrote to `path`; damaged parts raise errors of the libraries.
 
     Raises:
       ExportError: an export of another version, or a library is not installed.

@@ -164,7 +164,7 @@ def _require_same(plain: dict[str, Any], arrays: Mapping[str, Any], what: str) -
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ExportHead:
-    """What an export says of itself.
+    """Description of an export, by itself.
 
     Args:
       meta: of the records.
