@@ -46,6 +46,7 @@ LATER = (
     "touchr1_jax/rewards/",
     "touchr1_jax/training/evaluation.py",
     "touchr1_jax/training/questions.py",
+    "touchr1_jax/training/rollout_server.py",
     "touchr1_jax/training/train_grpo.py",
     *NEVER,
 )
