@@ -37,7 +37,8 @@ WRITTEN_BY_TUTORIAL = {"brevity"}
 
 
 def shown(text: str) -> Iterator[tuple[str, str]]:
-    """Module and arguments of every command in a text; `a|b` counts as two commands."""
+    """Module and arguments of every command in a text, lines that end in \\ joined; `a|b` counts as two commands."""
+    text = re.sub(r"\s*\\\n\s*", " ", text)
     for module, rest in MODULE.findall(text):
         yield from ((module, arguments) for arguments in choices(re.split(r"\s{2,}|\s#", rest)[0]))
     for name, rest in MAKE.findall(text):
