@@ -24,7 +24,7 @@ from touchr1_jax.training.rollout_server import RolloutsConfig
         ("encoder.stage_one.StageOneConfig", {"labelled": ()}, "labelled"),
         ("encoder.stage_one.StageOneConfig", {"tune_steps": (0, 5)}, "tune_steps"),
         ("encoder.stage_one.StageOneConfig", {"seeds": 0}, "seeds"),
-        ("engine.throughput_feed.FeedScale", {"study": presets.GPU, "devices": 3, "contacts": 8}, "devices is 3: .*= 64"),
+        ("engine.throughput_feed.FeedScale", {"study": presets.GPU, "devices": 3, "contacts": 8}, "devices is 3: .*64"),
         ("engine.gpu_workloads.GpuConfig", {"vision_px": 450}, "must be a multiple of 28"),
         ("engine.gpu_workloads.GpuConfig", {"frames": 7}, "frames of a patch"),
         ("engine.gpu_workloads.GpuConfig", {"rounds": 0}, "rounds"),
