@@ -123,11 +123,12 @@ def _vectorised(episodes: Episodes, seed: int) -> Any:
         def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
             return [getattr(self, attr_name)] * self.num_envs
 
+        # the interface asks for these two; PPO calls neither, and there is no environment of one episode to reach
         def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-            raise NotImplementedError
+            raise NotImplementedError(f"{attr_name}: episodes step together and have no attributes of their own")
 
         def env_method(self, method_name: str, *args: Any, indices: Any = None, **options: Any) -> list[Any]:
-            raise NotImplementedError
+            raise NotImplementedError(f"{method_name}: episodes step together and have no methods of their own")
 
         def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
             return [False] * self.num_envs

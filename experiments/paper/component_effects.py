@@ -85,6 +85,7 @@ def diagnose(
       consistency: whether the arm is rewarded for consistency.
     """
     history, both = history or TrainingHistory(start={}, end={}, alarms={}), before.keys() & after.keys()
+    # of two rules with one code the gradual one, which comes last, gives the meaning
     meanings = {rule.code: rule.meaning for rule in sorted(RULES, key=lambda rule: not rule.at_once)}
     for code, share in history.alarms.items():
         if share >= MOST:

@@ -308,9 +308,8 @@ class SeedTraining(StudySeed):
         return self.run_sft(self.config.blind, "blind", blind=True)
 
     def _blind(self) -> Evaluation:
-        return self.ask(
-            params := self._train_blind(), self.encode(params, "test", blind=True), samples=self.config.samples
-        )
+        params = self._train_blind()
+        return self.ask(params, self.encode(params, "test", blind=True), samples=self.config.samples)
 
     def _evaluate_all(self, name: str, params: Params, test: Features, noise: Array) -> None:
         """Save and evaluate a policy, then evaluate all variants of it."""
