@@ -25,7 +25,6 @@ makes none of it and answers worse.
 
 import dataclasses
 import functools
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +35,7 @@ from experiments.active.arms import (
     EVERY_TOUCH,
     Arm,
     LearnerConfig,
+    SeedPolicy,
     at_seconds,
     beliefs_of,
     check_arms,
@@ -57,6 +57,7 @@ from experiments.active.plans import Played
 from experiments.active.report import headroom_table
 from experiments.active.videos import StoppingConfig, stopping
 from experiments.active.world import TouchWorld, WorldConfig, make_world
+from experiments.core.concurrency import concurrently
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
 from experiments.core.results import Results, Table
@@ -127,13 +128,13 @@ def run(config: ActiveTouchConfig, context: Context) -> Results:
     policy = make_policy(world, config.learner)
     check_arms(world, policy, config.arms(0))
     tables = [_headroom(world, config, context)]
-    seeds: list[Mapping[str, Played]] = []
-    for seed in context.each("seeds", range(config.seeds)):
-        found, own = _seed(world, policy, config, seed, context)
-        seeds.append(found)
-        tables += own
+    train = lambda seed: _seed(world, policy, config, seed, context)
+    (first, warm, of_warm), *others = concurrently(context, "seeds", range(config.seeds), train)
+    cost = context.once("cost", lambda: step_cost(world, warm, config.learner, config.contacts, context))
+    agents, of_agents = _agents(world, policy, config, context)
+    seeds = [{**first, **agents}, *(found for found, _, _ in others)]
+    tables += [*of_warm, of_agents]
     results = findings(world, config.learner, config.contacts, seeds, tables, config.arms(0))
-    cost = context.load_stage("cost")
     return dataclasses.replace(
         results,
         requirements=(*results.requirements, *cost_requirements(cost)),
@@ -152,8 +153,8 @@ def _headroom(world: TouchWorld, config: ActiveTouchConfig, context: Context) ->
 
 def _seed(
     world: TouchWorld, policy: ActivePolicy, config: ActiveTouchConfig, seed: int, context: Context
-) -> tuple[dict[str, Played], list[Table]]:
-    """Actions of all plans and policies of one seed about test objects; of the first seed, its headroom too."""
+) -> tuple[dict[str, Played], SeedPolicy, list[Table]]:
+    """Actions of all plans and policies of a seed about test objects, its warm start, and of the first the headroom."""
     learner = config.learner
     warm = warm_start(world, policy, learner, config.contacts, seed, context)
     tables = []
@@ -172,26 +173,23 @@ def _seed(
         compute = functools.partial(one_step_look_ahead, world, warm, learner, seed, context)
         found |= from_json(context.once(f"played/imitation/{seed}", compute))
     several = counted("chosen", config.contacts)
-    if seed == 0:
-        context.once("cost", lambda: step_cost(world, warm, learner, config.contacts, context))
-        played, table = _agents(world, policy, config, {1: arms["chosen"], config.contacts: arms[several]}, context)
-        found |= played
-        tables.append(table)
     for plan in ("random", "best_press", "best_fixed", "by_question"):
         seconds = float(found[several].seconds.mean())
         found[f"{plan}_at_equal_seconds"] = dataclasses.replace(
             found[several], right=at_seconds(found, plan, seconds, config.contacts)
         )
-    return found, tables
+    return found, warm, tables
 
 
 def _agents(
-    world: TouchWorld, policy: ActivePolicy, config: ActiveTouchConfig, arms: Mapping[int, Arm], context: Context
+    world: TouchWorld, policy: ActivePolicy, config: ActiveTouchConfig, context: Context
 ) -> tuple[dict[str, Played], Table]:
-    """Agents of another library at the prices of these arms, by their number of contacts, and a table of them."""
+    """Agents of another library at the prices of the arms, and a table of them."""
     found: dict[str, Played] = {}
     settings: dict[str, Any] = {}
-    for contacts, arm in arms.items() if config.agents else ():
+    arms = config.arms(0)
+    for contacts in (1, config.contacts) if config.agents else ():
+        arm = arms[counted("chosen", contacts)]
         name = counted(AGENT, contacts)
         compute = functools.partial(agent_played, world, policy, arm, config.agent, name, 0, context)
         saved = context.once(f"played/{name}", compute)

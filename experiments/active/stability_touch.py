@@ -25,6 +25,7 @@ from experiments.active.plans import NO_CHOICE, Played
 from experiments.active.policies import explore
 from experiments.active.report import found_questions
 from experiments.active.world import TouchWorld, WorldConfig, make_world
+from experiments.core.concurrency import concurrently
 from experiments.core.context import Context, read_metrics
 from experiments.core.errors import ConfigurationError
 from experiments.core.results import Requirement, Results, Table, at_least, named_table
@@ -66,12 +67,18 @@ def run(config: StabilityTouchConfig, context: Context) -> Results:
     """Train the policy of every seed, and see where it begins."""
     world = make_world(config.world, context)
     policy = make_policy(world, config.learner)
-    probes, played, found = world.probes.of(world.parts["test"]), dict[int, Played](), dict[int, list[str]]()
-    for seed in context.each("seeds", range(config.first_seed, config.first_seed + config.seeds)):
+    probes, seeds = world.probes.of(world.parts["test"]), range(config.first_seed, config.first_seed + config.seeds)
+
+    def train(seed: int) -> tuple[Played, list[str]]:
         compute = functools.partial(_one_seed, world, policy, config, seed, context)
-        played[seed] = from_json(context.once(f"played/{seed}", compute))[NAME]
-        found[seed] = found_questions(config.world.contacts, played[seed], probes)
-        context.print(f"seed {seed}: {', '.join(found[seed])} found")
+        one = from_json(context.once(f"played/{seed}", compute))[NAME]
+        questions = found_questions(config.world.contacts, one, probes)
+        context.print(f"seed {seed}: {', '.join(questions)} found")
+        return one, questions
+
+    trained = dict(zip(seeds, concurrently(context, "seeds", seeds, train), strict=True))
+    played = {seed: one for seed, (one, _) in trained.items()}
+    found = {seed: questions for seed, (_, questions) in trained.items()}
     alarms = alarms_of(context)
     return Results(
         verdict=(verdict(found, alarms),),

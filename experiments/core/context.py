@@ -8,6 +8,7 @@ import contextlib
 import json
 import os
 import re
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -40,11 +41,12 @@ _STAGE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*(?:/[A-Za-z0-9_][A-Za-z0-9_.\-
 class MetricLog:
     """`metrics.jsonl`: one sealed line per logged step, each passed to the watchers.
 
-    Lines hold no clock: the file is the same, byte for byte, whether or not the run was ever interrupted.
+    Lines hold no clock, and in the end those of a seed follow those of the seed before it: the file is the same, byte
+    for byte, whether or not the run was ever interrupted, and however many seeds were trained at a time.
     """
 
     def __init__(self, path: Path, watchers: Sequence[Watcher] = ()) -> None:
-        self._path, self._watchers = path, watchers
+        self._path, self._watchers, self._lock = path, watchers, threading.RLock()
         self._seen: set[str] = set()
         lines = _whole_lines(path)
         write_text(path, "".join(lines))  # drops a line that a crash tore
@@ -52,29 +54,39 @@ class MetricLog:
 
     def rewind(self, stage: str, step: int) -> None:
         """Drop the lines of a stage at or past a step: they are about to be computed again."""
-        self._seen.add(stage)
-        lines = _whole_lines(self._path)
         before = lambda row: row["stage"] != stage or row["step"] < step
-        kept = [line for line in lines if before(_row(line, self._path))]
-        if len(kept) < len(lines):
+        with self._lock:
+            self._seen.add(stage)
+            lines = _whole_lines(self._path)
+            self._replace(lines, [line for line in lines if before(_row(line, self._path))])
+            for watcher in self._watchers:
+                watcher.rewound(stage, step)
+
+    def sort(self) -> None:
+        """Put the lines in the order of the seeds, which are the last part of the stages' names."""
+        with self._lock:
+            lines = _whole_lines(self._path)
+            self._replace(lines, sorted(lines, key=lambda line: _seed(_row(line, self._path)["stage"])))
+
+    def _replace(self, lines: list[str], by: list[str]) -> None:
+        if lines != by:
             self._file.close()
-            write_text(self._path, "".join(kept))
+            write_text(self._path, "".join(by))
             self._file = self._path.open("a", encoding="utf-8")
-        for watcher in self._watchers:
-            watcher.rewound(stage, step)
 
     def append(self, stage: str, step: int, scalars: dict[str, Any]) -> None:
         """Add one line and flush it; `ValueError` for a scalar that is not finite or takes the name of a field."""
         taken = {"stage", "step", CHECKSUM} & set(scalars)
         if taken:
             raise ValueError(f"scalars holds {sorted(taken)}: these are fields of every line; rename them")
-        if stage not in self._seen:
-            self.rewind(stage, step)
         values = jsonable(scalars, where=f"{stage} step {step}")
-        self._file.write(seal(json.dumps({"stage": stage, "step": step, **values})) + "\n")
-        self._file.flush()
-        for watcher in self._watchers:
-            watcher.logged(stage, step, values)
+        with self._lock:
+            if stage not in self._seen:
+                self.rewind(stage, step)
+            self._file.write(seal(json.dumps({"stage": stage, "step": step, **values})) + "\n")
+            self._file.flush()
+            for watcher in self._watchers:
+                watcher.logged(stage, step, values)
 
     def close(self) -> None:
         """Flush the file to the disk and close it."""
@@ -119,6 +131,9 @@ class Context:
         self.launcher = launcher
         self._opened = time.monotonic()
         self._watchers = watchers
+        self._lock, self._compiling = threading.RLock(), dict[str, threading.Lock]()
+        self.in_threads = False
+        """True while parts of the run are computed in several threads (`concurrency.concurrently`)."""
         self.loops: list[Loop] = []
         """The loops in progress, the outermost first."""
         self._log = MetricLog(directory / "metrics.jsonl", watchers) if processes.writes else None
@@ -142,14 +157,25 @@ class Context:
 
     def sampled(self, stage: str, step: int, sample: TrainingSample) -> None:
         """Show an answer of the policy that a stage trains; it is not logged."""
-        for watcher in self._watchers:
-            watcher.sampled(stage, step, sample)
+        with self._lock:
+            for watcher in self._watchers:
+                watcher.sampled(stage, step, sample)
 
     def rewind(self, stage: str, step: int) -> None:
         """Drop the logged lines of a stage at or past a step; needed only where the first new line may come later."""
         _checked(stage)
         if self._log is not None:
             self._log.rewind(stage, step)
+
+    def sort_log(self) -> None:
+        """Put the lines of the log in the order of the seeds, as if one had been trained after the other."""
+        if self._log is not None:
+            self._log.sort()
+
+    def compiling(self, program: str) -> threading.Lock:
+        """The lock of a program's first step: a thread that needs it too waits, and finds it compiled."""
+        with self._lock:
+            return self._compiling.setdefault(program, threading.Lock())
 
     @contextlib.contextmanager
     def progress(
@@ -164,12 +190,13 @@ class Context:
         self.loops.append(loop)
 
         def notify() -> None:
-            for watcher in self._watchers:
-                watcher.looping(self.loops)
+            with self._lock:
+                for watcher in self._watchers:
+                    watcher.looping(self.loops)
 
         try:
             notify()
-            with show_progress(self.console, loop, notify) as advance:
+            with show_progress(self.console, loop, notify, plain=self.in_threads) as advance:
                 yield advance
         finally:
             self.loops.remove(loop)
@@ -281,8 +308,9 @@ class Context:
     def add_time(self, name: str, seconds: float) -> None:
         """Add to the wall time under a name in `timing`."""
         if self.processes.writes:
-            kept = self.timing()
-            write_sealed(self._timing_file, kept | {name: kept.get(name, 0.0) + seconds})
+            with self._lock:
+                kept = self.timing()
+                write_sealed(self._timing_file, kept | {name: kept.get(name, 0.0) + seconds})
 
     def timing(self) -> dict[str, float]:
         """Wall seconds of every timed stage so far."""
@@ -344,6 +372,12 @@ def _row(line: str, path: Path) -> dict[str, Any]:
 
 def _damaged(path: Path, how: str) -> DamagedFileError:
     return DamagedFileError(f"{path} is damaged ({how}): put a copy back, or start a new run with --fresh")
+
+
+def _seed(stage: str) -> int:
+    """The seed of a stage; −1 of one without, which comes before all seeds."""
+    last = stage.rpartition("/")[2]
+    return int(last) if last.isdecimal() else -1
 
 
 def _checked(stage: str) -> str:

@@ -134,13 +134,18 @@ class Watcher:
 
 @contextlib.contextmanager
 def show_progress(
-    console: Console, loop: Loop, after: Callable[[], None] = lambda: None, *, every_s: float = PLAIN_EVERY_S
+    console: Console,
+    loop: Loop,
+    after: Callable[[], None] = lambda: None,
+    *,
+    every_s: float = PLAIN_EVERY_S,
+    plain: bool = False,
 ) -> Iterator[Advance]:
     """Show the progress of a loop and call `after` each advance.
 
-    A terminal gets a live bar, anything else a line every `every_s` seconds and one at the end.
+    A terminal gets a live bar, anything else, and a `plain` loop, a line every `every_s` seconds and one at the end.
     """
-    with (_bar if console.is_terminal else _plain_lines)(console, loop, every_s) as show:
+    with (_bar if console.is_terminal and not plain else _plain_lines)(console, loop, every_s) as show:
 
         def advance(steps: int = 1, note: str = "") -> None:
             loop.advance(steps, note)

@@ -4,6 +4,7 @@ import contextlib
 import os
 import signal
 import sys
+import threading
 import weakref
 from collections.abc import Callable, Iterator
 from types import FrameType
@@ -35,7 +36,8 @@ class Stopping:
 
     def __init__(self) -> None:
         self._number: int | None = None
-        self._patient = False
+        self._patient, self._lock = 0, threading.Lock()  # open patient blocks, of all threads
+        self._leaving = False
         self._raised: weakref.ref[Stopped] | None = None
 
     @contextlib.contextmanager
@@ -57,28 +59,38 @@ class Stopping:
     def patient(self, agreed: Callable[[bool], bool] = bool) -> Iterator[Callable[[], bool]]:
         """Delay the stop: the block polls the function that it gets, and leaves when that returns True.
 
+        Blocks of several threads may be open at a time; the main thread's must be the first and the last of them.
+
         Args:
           agreed: from "a signal came to this process" to "one came to any process of the run"; all processes call it
             equally often, so that all leave after the same step.
 
         Raises:
-          Stopped: when the block ends, if a signal came to any process.
+          Stopped: when the block ends, if a signal came to any process, or `leave` was called.
         """
         stop = False
 
         def poll() -> bool:
             nonlocal stop
-            stop = stop or agreed(self._number is not None)
+            stop = stop or agreed(self._number is not None or self._leaving)
             return stop
 
-        self._patient = True
+        self._open(1)
         try:
             yield poll
             poll()  # one that came after the last step
         finally:
-            self._patient = False
+            self._open(-1)
         if stop or self._number is not None:
             raise self._stopped(self._number or signal.SIGTERM)
+
+    def leave(self, leaving: bool = True) -> None:
+        """Have all patient blocks end as if a signal had come, for a thread beside them failed; or no longer."""
+        self._leaving = leaving
+
+    def _open(self, blocks: int) -> None:
+        with self._lock:
+            self._patient += blocks
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         del frame

@@ -1,6 +1,7 @@
 """The data of an experiment: contacts on disk, split by object into the parts that the stages use."""
 
 import dataclasses
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,8 @@ class Dataset:
     has_force: bool
     threads: int = 1
     statistics: dict[int, TouchBatch] = dataclasses.field(default_factory=dict)
+    computing: threading.Lock = dataclasses.field(default_factory=threading.Lock)
+    """Of the thread that computes the statistics, for which all others wait."""
 
     @property
     def training(self) -> np.ndarray:

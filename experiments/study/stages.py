@@ -129,9 +129,10 @@ def computed_touch(policy: TouchPolicy, data: Dataset, context: Context) -> Touc
         clips = _clips(data, rows, context, "computing statistics", batch_size=encoding.BATCH)
         return encoding.touch_statistics(tactile, map(touch_batch, clips))
 
-    if tactile.patch_px not in data.statistics:
-        data.statistics[tactile.patch_px] = context.processes.split_work(np.arange(len(data.store)), compute)
-    return data.statistics[tactile.patch_px]
+    with data.computing:
+        if tactile.patch_px not in data.statistics:
+            data.statistics[tactile.patch_px] = context.processes.split_work(np.arange(len(data.store)), compute)
+        return data.statistics[tactile.patch_px]
 
 
 def untrained(policy: TouchPolicy, data: Dataset, seed: int) -> Params:

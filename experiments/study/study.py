@@ -18,6 +18,7 @@ from rich.console import Console
 
 from experiments.core import numerics, runs
 from experiments.core.artifacts import write_json
+from experiments.core.concurrency import concurrently
 from experiments.core.context import Context
 from experiments.core.errors import DataError
 from experiments.study.cache import NEVER, fingerprint, source_digest
@@ -277,8 +278,10 @@ def train_study(
     made: Mapping[str, GRPOArm] = study["arms"]
     answers: dict[str, list[Evaluation]] = {name: [] for name in (SFT, CONTINUED, *arms, BLIND, *variants)}
     study |= {"share": share, "tactile": tactile, "variants": variants, "rollouts": rollouts}
-    for seed in context.each("seeds", range(config.seeds)):
-        for name, evaluation in SeedTraining(**study, seed=seed).answers().items():
+    train = lambda seed: SeedTraining(**study, seed=seed).answers()
+    at_once = 1 if policy.frozen else None  # of released weights one copy must do
+    for found in concurrently(context, "seeds", range(config.seeds), train, at_once=at_once):
+        for name, evaluation in found.items():
             answers[name].append(evaluation)
     further = {name: answers.pop(name) for name in variants}
     return Study(

@@ -26,6 +26,10 @@ from touchr1_jax.rl.rollout import GRPOBatch, drawn_log_probs, tempered, truncat
 from touchr1_jax.types import Params, Rollout
 
 
+LEAST_SAVED = 0.1
+"""Least share of the perturbed policy's tokens that branches must save: each takes some seconds to compile."""
+
+
 class Experience(NamedTuple):
     """Rollouts and what an update needs to learn from them; every field has a leading P.
 
@@ -81,7 +85,9 @@ def grpo_gradient(
             old = jnp.where(first, jax.lax.stop_gradient(terms.log_prob), old)
         rollout, w = micro.rollout, micro.weight
         a = micro.advantage if micro.token_advantage is None else micro.token_advantage
-        answer = None if left_out(algorithm.anchor) else answer_likelihood(fns, config, params, micro.batch)
+        answer = None
+        if terms.answer_log_prob is not None and micro.batch.answer_mask is not None:
+            answer = masked.mean(terms.answer_log_prob, micro.batch.answer_mask, -1)
         rollouts = old, rollout.log_prob, rollout.mask, a, w
         head = None if rollout.head_log_prob is None else jnp.moveaxis(rollout.head_log_prob, -2, -1)
         value, parts = grpo_loss(terms, *rollouts, config, longest, answer, micro.levels, head)
@@ -120,32 +126,13 @@ def log_probs(
     fns: PolicyFns, config: GRPOConfig, params: Params, batch: GRPOBatch, rollout: Rollout
 ) -> Float[Array, "P G T"]:
     """Log-probabilities of the sampled tokens under some parameters."""
-    algorithm = dataclasses.replace(config.algorithm, beta=0.0, gamma=0.0, entropy_weight=0.0)
+    algorithm = dataclasses.replace(config.algorithm, beta=0.0, gamma=0.0, entropy_weight=0.0, anchor=0.0)
     plain = dataclasses.replace(config, algorithm=algorithm)
     each = jnp.ones(rollout.mask.shape[:2])
     stream = jnp.zeros(len(each), jnp.int32)
     learn = Experience(batch, batch.features.touch, stream, rollout, rollout.log_prob, each, each[:, 0])
     of_micro_batch = lambda micro: experience_terms(fns, plain, params, params, micro).log_prob
     return in_order(jax.lax.map(of_micro_batch, batches_of(config.micro_prompts, learn)))
-
-
-def answer_likelihood(fns: PolicyFns, config: GRPOConfig, params: Params, batch: GRPOBatch) -> Float[Array, "P"]:
-    """Mean log-probability of a token of each prompt's verified answer, nat; 0 where a question has none.
-
-    Raises:
-      ValueError: a batch without answers.
-    """
-    if batch.answer is None or batch.answer_mask is None:
-        raise ValueError("anchor is above 0, but the batch holds no verified answers; make it with evidence, or set 0")
-    states = jax.vmap(lambda b: group_states(fns, config, b, b.answer[None])(params, b.features)[0][0])(batch)
-    head = at_precision(config, params)
-
-    def log_prob(rows: Rows) -> Array:
-        return token_log_probs(jax.nn.log_softmax(fns.logits(head, rows["own"])), rows["token"])
-
-    rows = {"own": states.reshape(-1, states.shape[-1]), "token": batch.answer.reshape(-1)}
-    found = by_blocks(log_prob, rows, width=len(fns.banned), most=config.max_logits)
-    return masked.mean(found.reshape(batch.answer.shape), batch.answer_mask, -1)
 
 
 def _grounding_by_stream(grounding: Float[Array, "P"], experience: Experience) -> dict[str, Array]:
@@ -174,11 +161,20 @@ def prompt_terms(
 ) -> TokenTerms:
     """Terms of every token of one prompt's group, [G, T], with at most `max_logits` logits of each policy at once.
 
-    The reference is not run at β = 0, nor the perturbed policy at γ = 0.
+    The reference is not run at β = 0, nor the perturbed policy at γ = 0.  With an anchor the verified answer is one more
+    completion of the policy's group.
+
+    Raises:
+      ValueError: an anchor, and a batch without answers.
     """
     algorithm, batch, tokens = config.algorithm, experience.batch, experience.rollout.tokens
-    states = group_states(fns, config, experience.batch, experience.rollout.tokens)
-    own, prefix = states(params, batch.features)
+    anchored = not left_out(algorithm.anchor)
+    if anchored and (batch.answer is None or batch.answer_mask is None):
+        raise ValueError("anchor is above 0, but the batch holds no verified answers; make it with evidence, or set 0")
+    group = jnp.concatenate([tokens, batch.answer[None]]) if anchored and batch.answer is not None else tokens
+    all_own, prefix = group_states(fns, config, batch, group)(params, batch.features)
+    own = jax.tree.map(lambda x: x[: tokens.shape[0]], all_own)
+    states = group_states(fns, config, batch, tokens)
     rows: Rows = {"own": own, "token": tokens}
     if algorithm.score_centering and experience.rollout.head_ids is not None:
         rows["head"] = jnp.moveaxis(experience.rollout.head_ids, -2, -1)
@@ -198,6 +194,11 @@ def prompt_terms(
     rows = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
     found = by_blocks(of_rows, rows, width=len(fns.banned), most=config.max_logits)
     terms = jax.tree.map(lambda x: x.reshape(*tokens.shape, *x.shape[1:]), found)
+    if anchored:
+        of_answer = {"own": jax.tree.map(lambda x: x[-1], all_own), "token": batch.answer}
+        log_prob = lambda r: token_log_probs(jax.nn.log_softmax(fns.logits(heads["own"], r["own"])), r["token"])
+        found = by_blocks(log_prob, of_answer, width=len(fns.banned), most=config.max_logits)
+        terms = terms._replace(answer_log_prob=found)
     if experience.levels is None:
         return terms
     return terms._replace(level_log_prob=level_log_probs(fns, config, heads["own"], own, experience.levels))
@@ -251,8 +252,9 @@ def perturbed_states(
 ) -> Any:
     """Hidden states of the completions under perturbed touch.
 
-    Only what follows the perturbed stream's first token is encoded again: for a single prompt exactly that, for a
-    batch of prompts, whose branches would all be computed, what follows the first stream's.
+    Only what follows the perturbed stream's first token is encoded again: for a single prompt exactly that, by a branch
+    for each stream.  What follows the first stream's is encoded for a batch of prompts, whose branches would all be
+    computed, and where branches save less than `LEAST_SAVED` of the tokens, for each of them is compiled.
 
     Args:
       prefix: the prompt as the policy encodes it.
@@ -265,7 +267,9 @@ def perturbed_states(
     def again(start: int, p: Params) -> Any:
         return states(p, features, known, start)[0]
 
-    if config.micro_prompts > 1:
+    computed = experience.batch.ids.shape[-1] - min(starts) + experience.rollout.tokens.size
+    saved = sum(starts) / len(starts) - min(starts)
+    if config.micro_prompts > 1 or saved < LEAST_SAVED * computed:
         return again(min(starts), own)
     return jax.lax.switch(experience.masked_stream, [functools.partial(again, start) for start in starts], own)
 

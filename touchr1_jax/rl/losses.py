@@ -45,6 +45,8 @@ class TokenTerms(NamedTuple):
     """log π of each level at the place where a rollout concludes, −∞ past the last one; only where it is enumerated."""
     head_log_prob: Float[Array, "*n K"] | None = None
     """log π of the sampler's most likely tokens; only where scores are centered."""
+    answer_log_prob: Float[Array, "*p T"] | None = None
+    """log π of each token of the prompt's verified answer; only with an anchor."""
 
 
 def grpo_loss(

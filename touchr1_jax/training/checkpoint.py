@@ -5,11 +5,13 @@ for a flipped bit on a disk raises no error of its own.  A damaged checkpoint is
 place.
 """
 
+import contextlib
 import itertools
 import json
 import logging
 import math
 import sys
+import threading
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -36,6 +38,9 @@ _MIX = 0x9E3779B1
 
 _FAILURES = (OSError, ValueError, KeyError, TypeError, RuntimeError, AssertionError, AttributeError, IndexError)
 """What Orbax and TensorStore raise where bytes cannot be read or written: they name no class of their own."""
+
+_SAVES = threading.Lock()
+"""Of the thread that saves: Orbax numbers the saves of a process, and mixes up those of two threads."""
 
 
 class CheckpointError(ValueError):
@@ -127,7 +132,8 @@ class Checkpoints:
     def save(self, step: int, state: Any, data: Any, score: float | None = None) -> None:
         """Save a pytree of arrays and a JSON value as checkpoint `step`; writing goes on in the background.
 
-        The arrays are copied first: the writer must not read buffers that the next step takes over by donation.
+        The arrays are copied first: the writer must not read buffers that the next step takes over by donation.  Where
+        several threads train, a save is complete when this returns.
 
         Args:
           step: its number.
@@ -146,10 +152,14 @@ class Checkpoints:
         args = ocp.args.Composite(
             state=ocp.args.StandardSave(state), data=ocp.args.JsonSave(held | {"crc32": _crc32(held)})
         )
+        others = threading.current_thread() is not threading.main_thread()
         try:
             self._manager.wait_until_finished()
             self._saving = step
-            self._manager.save(step, args=args, metrics=None if score is None else {"score": score})
+            with _SAVES if others else contextlib.nullcontext():
+                self._manager.save(step, args=args, metrics=None if score is None else {"score": score})
+                if others:
+                    self._manager.wait_until_finished()
         except _FAILURES as error:
             raise self._unsaved(error) from error
 

@@ -121,6 +121,29 @@ def test_micro_batches_of_one_prompt_give_the_same_gradient(one_stream):
         np.testing.assert_allclose(parts[name], value, rtol=1e-4, atol=1e-6, err_msg=name)
 
 
+def test_an_anchor_adds_the_likelihood_of_the_answers_and_its_gradient(experience, whole):
+    """As if each answer were a completion alone; of the first prompt none is known."""
+    b, tokens = experience.batch, tiny.completions(3, P, 1, T)
+    mask = jnp.arange(T) < jnp.array([[0], [1], [3], [T]])
+    answered = experience._replace(batch=b.replace(answer=tokens[:, 0], answer_mask=mask))
+
+    def likelihood(params):
+        log_p = jax.nn.log_softmax(group_logits(params, b.features, b.ids, b.mask, tokens))
+        each = jnp.sum(token_log_probs(log_p, tokens)[:, 0] * mask, -1) / jnp.maximum(jnp.sum(mask, -1), 1)
+        return jnp.mean(each)
+
+    value, slope = jax.value_and_grad(likelihood)(PARAMS)
+    anchored = dataclasses.replace(CONFIG, algorithm=dataclasses.replace(ALGORITHM, anchor=0.7))
+    grads, parts, _ = gradient(anchored)(answered)
+    np.testing.assert_allclose(parts["answer_likelihood"], value, rtol=1e-5)
+    np.testing.assert_allclose(parts["loss"], whole[1]["loss"] - 0.7 * value, rtol=1e-5)
+    scale = max(float(np.abs(g).max()) for g in jax.tree.leaves(grads))
+    for a, plain, more in zip(*map(jax.tree.leaves, (grads, whole[0], slope)), strict=True):
+        np.testing.assert_allclose(a, plain - 0.7 * more, atol=1e-5 * scale)
+    with pytest.raises(ValueError, match="anchor is above 0, but the batch holds no verified answers"):
+        gradient(anchored)(experience)
+
+
 def test_stopped_branch_changes_the_gradient_but_no_value(one_stream):
     stopped = dataclasses.replace(CONFIG, algorithm=dataclasses.replace(ALGORITHM, grounding_stop_masked=True))
     (free, free_parts, _), (held, held_parts, _) = compute(one_stream, PARAMS), gradient(stopped)(one_stream)

@@ -1,0 +1,68 @@
+"""Independent parts of a run, such as its seeds, computed at a time where one alone leaves cores idle."""
+
+import concurrent.futures
+import math
+import os
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+import jax
+
+from experiments.core.context import Context
+
+Item = TypeVar("Item")
+T = TypeVar("T")
+
+
+def concurrently(
+    context: Context, title: str, items: Sequence[Item], work: Callable[[Item], T], *, at_once: int | None = None
+) -> list[T]:
+    """The results of independent work on each item, in the order of the items, under a progress bar.
+
+    The steps of small policies use a part of the cores, so that two seeds on two cores take 1.2 to 1.5 times less than
+    one after the other.  Results and log are the same to the bit.  A signal ends the work of each item after its step.
+
+    Args:
+      context: the run.
+      title: of the bar.
+      items: of the work.
+      work: reads and writes only what no other item does, besides the run and the cache.
+      at_once: items at a time, each in a thread; by default `idle_cores`.
+
+    Raises:
+      Exception: the first of an item, once the others have ended after the step at hand.
+    """
+    threads = min(idle_cores(context) if at_once is None else at_once, len(items))
+    if threads <= 1:
+        found = [work(item) for item in context.each(title, items)]
+        context.sort_log()
+        return found
+    context.in_threads = True
+    try:
+        with (
+            context.stopping.patient(),
+            context.progress(title, len(items)) as advance,
+            concurrent.futures.ThreadPoolExecutor(threads) as pool,
+        ):
+            futures = [pool.submit(work, item) for item in items]
+            try:
+                for future in concurrent.futures.as_completed(futures):
+                    future.result()
+                    advance()
+            except BaseException:
+                context.stopping.leave()
+                pool.shutdown(cancel_futures=True)
+                raise
+    finally:
+        context.in_threads = False
+        context.stopping.leave(False)
+    context.sort_log()
+    return [future.result() for future in futures]
+
+
+def idle_cores(context: Context) -> int:
+    """Cores that may compute an item each: all of a machine without an accelerator, one where devices are shared."""
+    alone = context.processes.count == 1 and math.prod(context.devices.shape) == 1
+    if not alone or jax.default_backend() != "cpu":
+        return 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
