@@ -25,7 +25,6 @@ from touchr1_jax.rl.losses import TokenTerms, divisor, grpo_loss, token_log_prob
 from touchr1_jax.rl.rollout import GRPOBatch, drawn_log_probs, tempered, truncates
 from touchr1_jax.types import Params, Rollout
 
-
 LEAST_SAVED = 0.1
 """Least share of the perturbed policy's tokens that branches must save: each takes some seconds to compile."""
 
@@ -161,8 +160,8 @@ def prompt_terms(
 ) -> TokenTerms:
     """Terms of every token of one prompt's group, [G, T], with at most `max_logits` logits of each policy at once.
 
-    The reference is not run at β = 0, nor the perturbed policy at γ = 0.  With an anchor the verified answer is one more
-    completion of the policy's group.
+    The reference is not run at β = 0, nor the perturbed policy at γ = 0.  With an anchor, the verified answer is one
+    more completion of the policy's group.
 
     Raises:
       ValueError: an anchor, and a batch without answers.

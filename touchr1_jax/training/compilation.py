@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax.experimental.compilation_cache import compilation_cache
 
 WORTH_KEEPING_S = 0.1
@@ -75,6 +76,18 @@ def compiled_quickly() -> Iterator[None]:
             os.environ.pop(FLAGS, None)
         else:
             os.environ[FLAGS] = flags
+
+
+def committed(tree: Any) -> Any:
+    """The arrays of a tree committed to the default device, those that are committed to devices already as they are.
+
+    A compiled function has a program for each pattern of committed arguments.  Arrays of a checkpoint are committed,
+    fresh ones are not, and where one argument is, all results are: a step whose state mixes them would compile again
+    once its first results are its arguments.
+    """
+    (device,) = jnp.zeros(()).devices()
+    place = lambda x: x if isinstance(x, jax.Array) and x.committed else jax.device_put(x, device)
+    return jax.tree.map(place, tree)
 
 
 def remove_half_written(folder: Path, older_than_s: float = 60.0) -> int:

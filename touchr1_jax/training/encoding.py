@@ -14,6 +14,7 @@ from touchr1_jax.models.policy import Features
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.stacked import layer_by_layer
 from touchr1_jax.models.tactile_vit import TactileViTConfig, statistics_of
+from touchr1_jax.training.compilation import committed
 from touchr1_jax.types import Params, TouchBatch
 
 BATCH = 8
@@ -22,7 +23,7 @@ BATCH = 8
 
 def encode_contacts(fns: PolicyFns, params: Params, batches: Iterable[TouchBatch], *, blind: bool = False) -> Features:
     """Features of all contacts of some batches, in their order, on the host; a blind policy has no streams."""
-    encode = encode_program(fns, blind)
+    encode, params = encode_program(fns, blind), committed(params)
     found = [jax.device_get(encode(params, batch)) for batch in batches]
     return jax.tree.map(lambda *x: np.concatenate(x), *found)
 

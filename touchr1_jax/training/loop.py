@@ -15,7 +15,7 @@ import numpy as np
 
 from touchr1_jax.skipping import count_skipped
 from touchr1_jax.training.checkpoint import Checkpoints
-from touchr1_jax.training.compilation import return_memory
+from touchr1_jax.training.compilation import committed, return_memory
 from touchr1_jax.types import SAMPLE, StepSample
 
 Step = Callable[..., tuple[Any, dict[str, jax.Array]]]
@@ -115,6 +115,7 @@ class SingleDevice:
           constants: arguments that no step changes.
         """
         del batch_size
+        state, constants = committed((state, constants))
         return lambda s, b: step(s, b, *constants), state, batches
 
     def gather(self, tree: Any) -> Any:

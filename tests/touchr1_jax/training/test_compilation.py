@@ -13,12 +13,14 @@ from jax.experimental.compilation_cache import compilation_cache
 from touchr1_jax.training.compilation import (
     FLAGS,
     OLDER_LOOPS,
+    committed,
     compilations_kept,
     compiled_quickly,
     processor,
     remove_half_written,
     return_memory,
 )
+from touchr1_jax.training.loop import SingleDevice
 
 
 @pytest.fixture
@@ -137,3 +139,21 @@ def test_quickly_compiled_programs_compute_the_same(well):
     with compiled_quickly():
         quick = jax.jit(f)(x)
     np.testing.assert_allclose(quick, f(x), atol=1e-6)
+
+
+def test_a_step_compiles_once_whatever_part_of_its_state_came_from_a_checkpoint():
+    """Arrays of a checkpoint are committed to their device, fresh ones are not; results of a mixture are."""
+    of_checkpoint = jax.device_put(jnp.ones(3), jax.devices()[0])
+    state = {"params": of_checkpoint, "step": jnp.zeros(()), "key": jax.random.key(0)}
+    assert [x.committed for x in state.values()] == [True, False, False]
+
+    def compiled(start) -> int:
+        step = jax.jit(lambda s, b: ({**s, "step": s["step"] + b}, s["step"]))
+        for _ in range(3):
+            start, _ = step(start, np.float32(1))
+        return step._cache_size()
+
+    assert compiled(state) == 2
+    assert compiled(committed(state)) == 1
+    assert compiled(SingleDevice().shard(None, state, None, 1)[1]) == 1
+    assert committed(state)["params"] is of_checkpoint
