@@ -9,9 +9,9 @@ noise, and with another object's touch.
 
 Cost: about 60 minutes on two cores with five seeds (the controls more than double the rollouts); `--scale smoke` two.
 
-Expected: where a group has rewards of two values, right and wrong, division by σ cancels the literal bonus
-(`bonus_cancelled_share` against `bonus_telling_share`) and leaves the recommended one; the curves `touch_score` and
-`control_*` should lie further apart under `recommended` than under `none`.
+Expected: if a group has only two reward values, right and wrong, division by σ cancels the literal bonus
+(`bonus_cancelled_share` and `bonus_telling_share`) but not the recommended one.  The difference between the curves
+`touch_score` and `control_*` should be larger under `recommended` than under `none`.
 """
 
 from experiments.study.ablation import Ablation, ablation_experiment
