@@ -4,7 +4,7 @@
     make experiment EXP=ablation_ordinal ARGS="--data physiclear --data-dir DIR"
 
 Three arms of GRPO start from the same SFT checkpoint of each seed and see the same questions in the same order; they
-differ in the reward alone.  `zero_one` pays 1 for the right level, `ordinal` also 0.4 for a neighbour, both with the
+differ only in the reward.  `zero_one` gives 1 for the right level, `ordinal` also 0.4 for a neighbour, both with the
 published consistency term.  `debiased` subtracts from the ordinal credit what a constant answer would earn, so that no
 level is favoured, and rewards consistency only where the answer is right.  All give −0.1 for an answer that cannot be
 parsed.  All are compared with the control that continues SFT for as many seconds (`sft_continued`).

@@ -2,7 +2,7 @@
 
     make experiment EXP=ablation_tactile_use [ARGS="--scale smoke"]
 
-R_tu pays for answers that score higher with touch than without it.  Arms of GRPO from one SFT checkpoint per seed, the
+R_tu rewards answers that score higher with touch than without it.  Arms of GRPO from one SFT checkpoint per seed, the
 published reward, the same questions: no R_tu, the abstract's literal bonus, added to the reward before normalisation,
 and the recommended one, added to the advantage after it.  Each question is also sampled with the touch dropped, with
 noise, and with another object's touch.
