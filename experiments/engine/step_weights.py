@@ -1,6 +1,6 @@
 """Does a training step of a released model fit this machine, and how long does it compile?
 
-    python -m experiments step_weights [--scale smoke] [--size 3B|Qwen3-VL-4B|…] [--run]
+    python -m experiments step_weights [--scale smoke] [--size 3B|Qwen3-VL-4B] [--run]
 
 Compiles one step of SFT, end to end through the vision tower, and one of GRPO, both of adapters on frozen weights in
 bfloat16, at a released shape without weights, and reads the memory that the compiler reserves.  Decoder and vision

@@ -1,4 +1,4 @@
-"""If picture and touch of an object disagree, which does the policy follow, and what does it lose without touch?
+"""When picture and touch of an object disagree, which does the policy follow, and what does it lose without touch?
 
     make experiment EXP=conflict [ARGS="--scale smoke|gpu|paper"]
 

@@ -12,9 +12,9 @@ scoring, resuming or saving, because rounding to the weights' type would lose sm
 the adapted layers of the decoder, `--lora.vision-targets` those of the vision tower, `--lora.rank-stabilised` scales
 by rsLoRA.  The policy is scored on unseen objects and compared with the released model, which sees the picture and no
 touch, with the same training without touch, and with constants; it is evaluated again under each control of touch.
-It is written to `policies/NAME/SEED` of the run, adapters in PEFT's format, and evaluated again from there; `python
--m experiments ask RUN/touch_r1/0 INPUT` asks it about new data, `python -m experiments export` merges it into whole
-weights.
+The run saves it in `policies/NAME/SEED`, with adapters in PEFT's format, and evaluates it again from there.
+`python -m experiments ask RUN/touch_r1/0 INPUT` asks it about new data;
+`python -m experiments export RUN/touch_r1/0 FOLDER` merges it into whole weights.
 
 `--scale smoke` makes a tiny checkpoint of the released format if none is given, `smoke_qwen3` one of Qwen3-VL.  Both
 test the code, and their figures mean nothing.  With their random, frozen embeddings, no decoder can give the

@@ -1,7 +1,7 @@
 """What do a billion generated records cost, and what limits them on 1, 10, 100 and 1,000 machines?
 
     python -m experiments scale_records
-    python -m experiments scale_records --hourly-price 0.8 --bandwidth-gb-s 0.5      (your machines)
+    python -m experiments scale_records --machine.hourly-price 0.8 --machine.bandwidth-gb-s 0.5      (your machines)
 
 Measures the CPU time and the bytes of a record, the requests to write a shard to a store and to read it, and the index
 of 10⁴ and 10⁷ contacts.  The report multiplies them by the counts of a billion records: all figures of its last two
