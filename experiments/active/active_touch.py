@@ -2,25 +2,25 @@
 
     python -m experiments active_touch [--scale smoke]
 
-With a label for every object, no label says which touch to make.  Generated objects are touched by every motion at two
-forces by each of four sensors.  A policy is asked for one of five properties, chooses a touch, observes it, and touches
-again or concludes.  A warm start imitates touches drawn at random, so that nothing shows which of them is good.  GRPO
-on whole trajectories then rewards the answer, less a price of seconds and of harm: of contacts that strain the gel or
-the object past its limit.  Before anything is learned the report states what there is to win, from probes and from the
-policy's own beliefs.  Controls: touches at random, the best press, the best touch for all questions, the best touch for
+Every object has labels, but no label gives the best touch.  Each of four sensors touches generated objects with every
+motion at two forces.  A policy receives a question about one of five properties, chooses a touch, observes it, and
+touches again or concludes.  SFT on random touches comes first; it does not show which touch is good.  GRPO on whole
+trajectories then rewards the right answer, minus a price for seconds and for harm (contacts that strain the gel or the
+object past its limit).  The report first gives the largest possible gain from choosing, by probes and by the policy's
+own beliefs.  Controls: touches at random, the best press, the best touch for all questions, the best touch for
 each question (all looked up on validation objects), a look-up order with a threshold on belief, imitation of a one-step
 look-ahead, a policy whose observations are hidden while it chooses, every touch, the exact optimum over trees.
 
 `--physiclear DIR` adds real touch: several videos of an object as contacts, and a policy that learns when to stop.
 `--agents` adds PPO of Stable-Baselines3 in the same environment.
 
-Cost: 77 minutes beside other work, 64 of them of user CPU time, with contacts that were made before: the first seed,
-which trains all arms, 36 minutes, each further seed eight to twelve.  The contacts take about thirteen minutes of CPU
-time, once (`smoke` one minute and a half).
+Cost: 77 minutes on a busy machine (64 minutes of user CPU time) with cached contacts: 36 minutes for the first seed,
+which trains all arms, eight to twelve for each further seed.  The contacts take about thirteen minutes of CPU time,
+once (`smoke` one minute and a half).
 
 Expected, and found in the recorded run: one touch chosen by reward is seven points better than the best touch for all
-questions and as good as the best touch for each question.  A second touch adds little, and a policy that pays for harm
-makes none of it and answers worse.
+questions and as good as the best touch for each question.  A second touch adds little, and a policy with a price on
+harm avoids harm and answers worse.
 """
 
 import dataclasses

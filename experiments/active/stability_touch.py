@@ -2,10 +2,10 @@
 
     python -m experiments stability_touch [--scale smoke]
 
-The policy of one touch of `active_touch`, whose contacts and readers it shares, over ten seeds.  Each seed warm-starts
-on touches drawn at random and then learns from reward; no label says which touch is good.  A question is found where
-the commonest first motion about test objects is the one that is best by linear probes, or lies within the interval of
-its accuracy.  The alarms of policies that explore (A1 to A5) are those that rang during training.
+Trains the one-touch policy of `active_touch` with ten seeds, on the same contacts and readers.  Each seed trains on
+random touches by SFT and then learns from reward; no label gives the best touch.  A seed solves a question if the most
+frequent first motion on test objects is the best by linear probes, or lies within the interval of the best.  The report
+lists the alarms of exploring policies (A1 to A5) that fired during training.
 
 Cost: five minutes of CPU time a seed, and the contacts, thirteen minutes once (`smoke` one minute).
 

@@ -1,17 +1,18 @@
-"""Is the benchmark sound: no leak between splits, no answer that a constant guesses, every rationale supported?
+"""Is the benchmark valid: no leak between splits, no gain for constant answers, every rationale supported?
 
     make experiment EXP=dataset_card
     make experiment EXP=dataset_card ARGS="--data records --data-dir RECORDS"
 
-Makes the bench of 4,800 questions about the 200 test objects of a thousand, in four tiers and seven kinds, words it
-from the measurements, filters it by the rules and checks it against the data card.  A check that fails ends the run
-with an error.  Errors of every kind are then planted, which the rules must find, and the bench is made twice.  It is
-written to the run as `items.jsonl`; `python -m experiments.bench --help` makes, words, annotates and audits others.
+Makes the bench of 4,800 questions about the 200 test objects of a thousand, in four tiers and seven kinds, writes the
+rationales from the measurements, filters the questions by the rules and checks them against the data card.  A failed
+check ends the run with an error.  The rules must then detect injected errors of every kind, and making the bench a
+second time must give the same questions.  The run contains it as `items.jsonl`; `python -m experiments.bench --help`
+lists the commands that make, word, annotate and audit other benches.
 
 Cost: about three minutes on one core, most of it for the scenes; `--scale smoke` a few seconds.
 
-Expected: all checks pass; no constant beats chance by three points.  The sensors' numbers, each read by its thresholds,
-give the right answer to about half of the questions, material least.
+Expected: all checks pass; no constant is three points above chance.  Thresholds on the sensors' measurements answer
+about half of the questions right, those about material least often.
 """
 
 import collections

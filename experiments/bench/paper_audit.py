@@ -2,9 +2,9 @@
 
     make experiment EXP=paper_audit [ARGS="--vtv-items N"]
 
-Every number of the paper on which a conclusion rests is typed in `study/paper_numbers.py` under the table or section
-where it is printed; every inconsistency is a check that recomputes what follows from these numbers, with rounding
-granted.  Nothing is trained and no data is read.
+`study/paper_numbers.py` contains every number of the paper on which a conclusion depends, with its table or section.
+Each check recomputes a statement of the paper from these numbers, within rounding.  The experiment trains nothing and
+reads no data.
 
 Cost: seconds.
 

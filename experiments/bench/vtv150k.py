@@ -1,13 +1,13 @@
-"""What do touch, force and guessing score under the protocol of VTV150K, compared with the paper's table?
+"""How do touch, force and guessing score under the protocol of VTV150K, compared with the paper's table?
 
     make experiment EXP=vtv150k [ARGS="--scale smoke"]
 
 Nine tasks about recordings of unseen objects: hardness, protrusion, elasticity, friction, all four at once, which of
 two has more, which of three most or least, which recording belongs to which object, which suits a scenario.  VTV150K's
 videos have no published levels; here a recording is a slide and a press that is released, on the same generated object,
-by four sensors.  Linear probes on fixed features answer, fitted without the object; for comparison force with touch and
-alone, true shape alone, the frequency of the levels, and guessing.  No policy answers: its language has no words for
-elasticity and friction.
+by four sensors.  Linear probes on fixed features, fitted on other objects, answer.  Baselines are force with and
+without touch, true shape alone, the frequency of the levels, and guessing.  No policy answers, because its language has
+no words for elasticity and friction.
 
 Cost: about four minutes of one core, nearly all of it to make the recordings; `--scale smoke` half a minute.
 

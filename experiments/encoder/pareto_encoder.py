@@ -1,18 +1,18 @@
-"""How much of a touch must an encoder read, in milliseconds against the accuracy of probes on it?
+"""How much of a touch must an encoder read: time of a forward pass against the accuracy of probes?
 
     make experiment EXP=pareto_encoder [ARGS="--scale smoke"]
 
-Prompts of 8 frames by four sensors at 112².  Every variant saves in one way: fewer tokens by joining frames, frames
-chosen by salience, patches chosen by contact, the quiet rest merged, fewer pixels, another width, fields in place of
-pictures; the reference has 256 tokens a stream.  Each is trained by stage 1 on the same contacts in the same order and
-read by linear probes on unseen objects; forward passes are timed interleaved, on the cores that the process has.  The
-fastest within a point of the reference is chosen on the validation objects; the reported figures are of the test
-objects.
+Prompts of 8 frames by four sensors at 112².  Every variant saves time in one way: joined frames, frames selected by
+salience, patches selected by contact, merged patches without contact, fewer pixels, another width, or fields instead of
+pictures; the reference has 256 tokens per stream.  Stage 1 trains each variant on the same contacts in the same order.
+Linear probes score it on unseen objects.  Forward passes are timed in alternation, on the cores of the process.  The
+fastest variant within a point of the reference is chosen on the validation objects; the reported figures are those of
+the test objects.
 
 Cost: about fifteen minutes on one core with the data, `--scale smoke` under one.
 
-Expected: a patch of 28 px with the energies of its filters holds what the labels are about, so that 64 tokens lose
-nothing against 256; dropping patches outside the contact saves time in proportion and costs little.
+Expected: patches of 28 px with the energies of their filters contain the information about the labels, so that 64
+tokens are as good as 256; dropping patches outside the contact saves time in proportion and costs little.
 """
 
 import dataclasses

@@ -1,13 +1,13 @@
-"""What makes latent prediction collapse, do the alarms notice it, and what cures it?
+"""What makes latent prediction collapse, do the alarms detect it, and what prevents it?
 
     make experiment EXP=stability_encoder [ARGS="--scale smoke"]
 
-Stage 1 in small: pictures of 28 px of two sensors, an encoder of one layer, ten seeds in one program.  Guards are
+A small stage 1: pictures of 28 px of two sensors, an encoder of one layer, ten seeds in one program.  Safeguards are
 removed one after the other (variance and covariance terms, moving average, stop-gradient), the learning rate is raised,
-then single guards are restored.  Validation objects give the spread between contacts relative to the size of the
-latents, effective rank and skill over copying the last latent; an alarm is raised if one passes its bound twice in a
-row and none recovers.  A run has failed if the spread between the test contacts ends below half of that before
-training.
+then single safeguards are restored.  Three metrics on validation objects are watched: the spread between contacts
+relative to the size of the latents, the effective rank, and the skill over copying the last latent.  An alarm fires if
+a metric passes its bound twice in a row and none recovers.  A run fails if the final spread between test contacts is
+below half of the spread before training.
 
 Cost: about six minutes on one core, `--scale smoke` under one.
 

@@ -6,9 +6,9 @@
 Every method trains the same encoder on the touch of all training objects, without labels: prediction of the next latent
 (`dynamics`), contrast between the sensors of one contact (`contrast`), prediction of hidden patches against an averaged
 encoder (`masked`), estimation of force and depth (`physics`).  Then each encoder, and a random one, is fine-tuned in
-the same way on 10, 30, 100 and 300 labelled contacts and asked for hardness, roughness and protrusion of unseen
-objects.  The number of fine-tuning steps and the best method are chosen on validation objects.  With recordings that
-hold no depth, `physics` learns force alone.
+the same way on 10, 30, 100 and 300 labelled contacts and predicts hardness, roughness and protrusion of unseen
+objects.  The number of fine-tuning steps and the best method are chosen on validation objects.  With recordings
+without depth, `physics` learns only force.
 
 Cost: about half an hour on two cores with data, `--scale smoke` under two minutes.
 

@@ -1,17 +1,17 @@
-"""How well can the next frames of a tactile sensor be predicted from those before, and does vision help?
+"""How well can the next frames of a tactile sensor be predicted from the earlier ones, and does vision help?
 
     make experiment EXP=video_prediction [ARGS="--encoder runs/pretrain_encoder/latest"]
 
-From the frames of a press up to t, and for one of the two predictors also the picture of the object, to the frames 3
-and 5 levels of force later, in [0, 1] pixels of 112², by four sensors; scored on objects that training never used, for
-every t.  Next to L1 and SSIM (11 × 11 Gaussian) the distance of a tactile encoder's features is reported; LPIPS needs
-weights that may not be distributed: `--lpips-weights FILE.npz` adds it (see `touchr1_jax.bench.image_similarity`).
+Two predictors read the frames of a press up to t, one of them also the picture of the object.  They predict the frames
+3 and 5 levels of force later, in [0, 1] pixels of 112², for four sensors and every t, on objects unseen in training.
+Scores are L1, SSIM (11 × 11 Gaussian) and the distance of a tactile encoder's features.  LPIPS needs weights that may
+not be distributed: `--lpips-weights FILE.npz` adds it (see `touchr1_jax.bench.image_similarity`).
 
 Cost: about nine minutes on one core, `--scale smoke` under one.
 
-Expected: copying the last frame is poor because contacts grow; the mean frame knows the force and not the object; a
-predictor must beat both.  The picture shows shape but can mislead about material, so it should help early frames a
-little.
+Expected: copying the last frame is poor because contacts grow; the mean frame contains the force and not the object; a
+predictor must be better than both.  The picture shows shape but can mislead about material, so it should help early
+frames a little.
 """
 
 import dataclasses

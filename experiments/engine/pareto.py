@@ -1,4 +1,4 @@
-"""Is any default dominated: was another method measured to be better on one axis and worse on none?
+"""Is any default dominated by another method, which is better on one axis and worse on none?
 
     make experiment EXP=pareto [ARGS="--others DIR"]
 

@@ -5,9 +5,9 @@
 Every preset at every group size learns to write low token ids (see `experiments.engine.job`) from the same decoder and
 prompts, at one learning rate, with the same number of rollouts and steps: a larger group has fewer prompts.  The score
 is the mean reward over the last tenth of the steps; a run reaches the target at the first step whose mean reward passes
-it.  Time is the number of steps times the median seconds of a step, which is measured in rounds with all other
-programs, so that neither compilation nor other load on the machine counts.  Where a preset passes groups over, the
-reward is that of all rollouts that were drawn, which can be compared.
+it.  Time is the number of steps times the median time of a step, which is measured in rounds with all other programs,
+so that compilation and other load on the machine do not count.  If a preset skips groups, the reward is the mean over
+all sampled rollouts, so that presets are comparable.
 
 Options of sampling, advantage, reward, lag and reference are charted one by one against the published objective in the
 small world of touch, by accuracy and time (see `experiments.engine.grpo_options`).

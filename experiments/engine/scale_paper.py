@@ -4,11 +4,11 @@
 
 Touch-R1 trained Qwen2.5-VL 7B on sixteen H200 with 8 frames of 448² from four sensors and groups of eight.  Here the
 same step, with the reference and the counterfactual policy, is compiled for sixteen devices without weights and without
-the devices, and the memory that the compiler reserves is compared with a count by hand.  `--compiler cpu` is the
-compiler of this machine; `--compiler h200` is the GPU's, which needs JAX's CUDA plugin but no GPU.  Other meshes, and
-adapters on a frozen base, are counted; `--compiled N` compiles more of them.  To train in this layout give a study
-`--distributed --mesh.fsdp 8 --mesh.tensor 2`, in one process per GPU under Slurm, with `grpo.remat`, `grpo.bfloat16`
-and one prompt a micro-batch.
+the devices, and the memory that the compiler reserves is compared with an analytic count.  `--compiler cpu` uses the
+compiler of this machine; `--compiler h200` uses the GPU's, which needs JAX's CUDA plugin but no GPU.  For other meshes,
+and for adapters on a frozen base, memory is counted; `--compiled N` compiles more of them.  To train in this layout,
+run a study with `--distributed --mesh.fsdp 8 --mesh.tensor 2`, in one process per GPU under Slurm, with `grpo.remat`,
+`grpo.bfloat16` and one prompt a micro-batch.
 
 Cost: 5 to 10 minutes on one core with one mesh compiled; `--scale smoke` half a minute.
 

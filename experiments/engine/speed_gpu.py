@@ -2,14 +2,14 @@
 
     make experiment EXP=speed_gpu [ARGS="--scale smoke"]
 
-On the first device, in bfloat16 but for the tactile encoder, which computes in float32: a plain matrix product as the
-yardstick; causal attention of prompts at the 7B's shapes, by the engine and by flash attention through
+On the first device, in bfloat16 except for the tactile encoder (float32): a plain matrix product as the
+reference; causal attention of prompts at the 7B's shapes, by the engine and by flash attention through
 `jax.nn.dot_product_attention`, both compared with float32; the tactile encoder and Qwen2.5-VL's vision tower, forward
 and backward; decoding, and one GRPO step of a policy of Qwen2.5's 1.5B shape with the reference and the counterfactual
-pass.  The memory that the compiler reserves for a step is compared with the count by hand that `scale_paper` uses.
-Without a GPU it refuses to run; `--scale smoke` is tiny and runs anywhere, to try the code.
+pass.  The memory that the compiler reserves for a step is compared with the analytic count of `scale_paper`.
+The experiment needs a GPU; `--scale smoke` is tiny, runs anywhere, and tests the code.
 
-Cost: not measured, for no GPU was at hand yet; `--scale smoke` under a minute.
+Cost: not measured, because no GPU was available; `--scale smoke` under a minute.
 
 Expected: the product reaches 60 to 80 % of the data sheet, flash attention several times the engine's speed; decoding
 is bound by the memory, so that a GRPO step stays below a third of the peak.

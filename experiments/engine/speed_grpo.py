@@ -8,8 +8,8 @@ prefixes of 64 to 1024 tokens, each in two processes of its own: one that compil
 programs.  It is compared with the engine's options, with an engine that encodes the prefix for every rollout, and with
 TRL and Tunix where they can be imported (see `harness_trl.py` and `harness_tunix.py`).  A large vocabulary and ten
 thousand steps, whose time and memory must stay constant, are measured too.  Matrix products are timed in the same
-process, so that shares of the peak need no data sheet, and every shape of product of an iteration is timed alone, on a
-quiet machine an estimate of the least time that these shapes take (see `matrix_floor.py`).
+process, so that shares of the peak need no data sheet.  Every shape of product of an iteration is also timed alone; on
+an idle machine, the sum estimates the lower bound of an iteration (see `matrix_floor.py`).
 
 Cost: about six minutes on two cores, as much again for the two other engines; `--scale smoke` under one.
 

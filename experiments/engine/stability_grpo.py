@@ -1,13 +1,12 @@
-"""Where does reinforcement learning from touch fail, does the stable preset hold there, and does an alarm notice it?
+"""Where does reinforcement learning from touch fail, does the stable preset avoid the failure, and does an alarm fire?
 
     make experiment EXP=stability_grpo [ARGS="--scale smoke"]
 
-Twelve known failures, each driven by one knob until the published objective, or a variant named in the table, fails.
-Small policies are trained by the library's own step in a world of touch whose truth is known (see
-`experiments.engine.world`): supervised on verified answers, then reinforced, ten seeds for each value of each knob.
-Each failure has a criterion of its own, fixed before the runs (`experiments.engine.failures`).  The `stable` preset is
-trained at the same values, and the alarms are those that either would have raised during training.  Presets, bounds and
-knobs were chosen on seeds 100 to 109; seeds 0 to 9 are reported.
+For each known failure, one parameter is increased until the published objective, or a variant named in the table,
+fails.  The library's own step trains small policies by SFT, then GRPO, in a simulated world of touch with known truth
+(`experiments.engine.world`), with ten seeds for each value of the parameter.  Each failure has its own criterion, fixed
+before the runs (`experiments.engine.failures`).  The `stable` preset is trained at the same values.  Alarms are those
+of training.  Presets, bounds and parameters were chosen on seeds 100 to 109; seeds 0 to 9 are reported.
 
 Cost: about 17 minutes on one core, 12 once everything is compiled; `--scale smoke` about one, most of it compilation.
 

@@ -1,14 +1,14 @@
 """Does a training step of a released model fit this machine, and how long does it compile?
 
-    python -m experiments step_weights [--scale smoke] [--size 3B|Qwen3-VL-4B|…] [--run]
+    python -m experiments step_weights [--scale smoke] [--size 3B|Qwen3-VL-4B] [--run]
 
-One step of SFT, end to end through the vision tower, and one of GRPO, both of adapters on frozen weights in bfloat16,
-are compiled at a released shape without weights, and the memory that the compiler reserves is read.  Decoder and vision
-tower are loops over stacked layers, so that a program does not grow with depth: the same steps of a decoder of
-`shallow` layers say by how much compiling grows.  `--run` also runs both steps, on drawn weights, in a process of
-their own, whose largest resident size is measured.
+Compiles one step of SFT, end to end through the vision tower, and one of GRPO, both of adapters on frozen weights in
+bfloat16, at a released shape without weights, and reads the memory that the compiler reserves.  Decoder and vision
+tower are loops over stacked layers, so that a program does not grow with depth; the same steps of a decoder of
+`shallow` layers measure the growth of compilation time.  `--run` also runs both steps with random weights in a separate
+process and measures its largest resident size.
 
-Cost: two to five minutes of one core for the 3B, as much memory as the weights and half as much again with `--run`.
+Cost: two to five minutes of one core for the 3B; with `--run`, 1.5 times the memory of the weights.
 
 Expected: 1.0 to 1.1 times the seconds from 8 to 36 layers; 14 GB for the 3B.
 """

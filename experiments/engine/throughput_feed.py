@@ -2,12 +2,12 @@
 
     make experiment EXP=throughput_feed [ARGS="--scale smoke"]
 
-Measured are the seconds of a core that a batch of SFT or GRPO takes at `--scale gpu`, one H200, and `--scale paper`,
-sixteen, from records and from the memory that the scale keeps clips in; predicted is the shortest step of the devices,
-counted from shapes at an assumed share of their peak.  Then the training loop runs with these batches and a simulated
-device that computes nothing for as long; the share of the time that it stands still is the result.  A device has 16
-cores; where fewer are here, its steps last longer, at most until supply and demand stand to each other as there.  No
-accelerator is needed and none is measured; losses by the transfer of a batch do not show.
+Measures the CPU time of a batch of SFT or GRPO at `--scale gpu` (one H200) and `--scale paper` (sixteen), read from
+records and from the memory in which the scale stores clips.  Predicts the shortest step of the devices from shapes and
+an assumed share of their peak.  The training loop then runs with these batches and a simulated device that waits for
+the predicted time; the result is the share of the time that the device is idle.  A device has 16 cores; on a machine
+with fewer cores, its steps are lengthened, at most until the ratio of supply and demand is the same.  The experiment
+needs and measures no accelerator; it does not include the transfer of batches.
 
 Cost: about three minutes on two cores, most of it making the records; `--scale smoke` half a minute.
 

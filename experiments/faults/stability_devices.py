@@ -2,13 +2,13 @@
 
     python -m experiments stability_devices [--data-dir DIR] [--scale smoke]
 
-One hour of a 120 Hz camera in compressed time, with 2 % drops, duplicates, jitter, a clock that gains 50 ppm and three
-disconnects, read through the package's reader: with the device's counter, without it (losses are then estimated from
-the stamps, duplicates recognised by their pictures), and by a consumer too slow for its ring.  The reader's counts are
-compared with the injected faults; memory is logged at every tenth of the hour, once with Python's own traced.  Then
-come the vendor's Tac3D recordings in DIR/tac3d, whose real gaps must be counted exactly, and the time to decode a
-message, cached and by YAML where ruamel.yaml is installed.  Last, a camera at its true rate is recorded while browsers
-watch it, and a bridge carries the pictures of a vendor's camera.
+The package's reader reads one hour of a 120 Hz camera in compressed time, with 2 % drops, duplicates, jitter, a clock
+that gains 50 ppm and three disconnects.  It reads with the device's counter, without it (it then estimates losses from
+timestamps and recognises duplicates by their pictures), and with a consumer too slow for its ring buffer.  Its counts
+are compared with the injected faults; memory is logged at every tenth of the hour, once with Python's own memory
+traced.  In the vendor's Tac3D recordings in DIR/tac3d, the real gaps must be counted exactly.  The time to decode a
+message is measured, cached and by YAML if ruamel.yaml is installed.  Finally, a camera at its true rate is recorded
+while browsers display it, and a bridge transfers the pictures of a vendor's camera.
 
 Two minutes on one core (`smoke` twenty seconds).  Expected: with a counter every sample is accounted for; without one
 the estimate is off by one in a thousand of the losses until stamps jitter by a quarter of the period; memory stays

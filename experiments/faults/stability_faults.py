@@ -1,20 +1,20 @@
-"""Does training that is killed or gets damaged input end with bit-identical results, or name the fault?
+"""Does training that is killed or reads damaged input end with bit-identical results or with a clear error?
 
     make experiment EXP=stability_faults [ARGS="--scale smoke"]
 
-Four parts. Kills: training is ended by `kill -9` at random moments, a quarter of them while it starts and the others
-spread over the whole run, and continued until it is done; logs, answers and the final state of every stage are compared
-bit by bit with those of an undisturbed run. Two trainings are killed, with networks so small that the loop around a
-step takes most of its time: a study's GRPO, whose session starts in seconds, 200 times, and a whole study of supervised
-fine-tuning, GRPO and a baseline without touch, a few times. Damage: every file of an unfinished run, in four ways, and
-single bits of all files of an unfinished and of a finished study and their caches, which are read and then go on. Bad
-input: some forty kinds through the public command lines. Waiting: the share of a step that waits for data, at the sizes
-of the studies, on a CPU.
+Four parts.  Kills: `kill -9` ends training at random moments, a quarter of them during start-up and the others spread
+over the whole run, and the run is continued until it is finished; logs, answers and the final state of every stage are
+compared bit by bit with those of an undisturbed run.  The networks are so small that the loop takes most of the time of
+a step.  The GRPO of a study, which starts in seconds, is killed 200 times; a complete study of supervised fine-tuning,
+GRPO and a baseline without touch is killed a few times.  Damage: every file of an unfinished run is damaged in four
+ways, and single bits are flipped in all files of an unfinished and a finished study and their caches; the files are
+read and the run is continued.  Bad input: about forty kinds through the public command lines.  Waiting: the share of a
+step that waits for data, at the sizes of the studies, on a CPU.
 
 Cost: about 25 minutes on one core, most of it the 200 kills; `--scale smoke` about a minute and a half.
 
-Expected: no difference in any bit; no wrong end; every bad input answered with error, place and way out; waits below
-2 % of a step.
+Expected: no difference in any bit; no wrong result; for every bad input an error that names the place and the fix;
+waits below 2 % of a step.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""How wrong is each field, and what does it cost?
+"""How accurate is each method for depth, motion, shear and force, and how fast?
 
     python -m experiments pareto_fields [--data-dir DIR] [--scale smoke]
 
@@ -10,8 +10,7 @@ recordings by folder (gelslam, FOTS, gelsight_sim2real, feelanyforce, …); with
 Splits: each press is scored by a map whose circles, degrees and constants come from the other presses alone; balls of
 other diameters and presses at known depth took no part in any fit. The weight of flat pixels was chosen on gelslam's
 held-out balls, that of rims on those of gelslam and gelsight_sim2real. The zero level, the rule for the degrees and
-the threshold of a contact were set with the known depths, feelanyforce, gelslam and FOTS in view: those rows are not
-blind.
+the threshold of a contact were chosen on the known depths, feelanyforce, gelslam and FOTS: those rows are not blind.
 
 Six minutes on one core with DIR (`smoke` half a minute).  Expected: the polynomial whose constants vary over the
 picture is as good as the perceptron and several times as fast; published integrators are off by up to a factor of two.

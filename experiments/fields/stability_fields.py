@@ -1,18 +1,18 @@
-"""Where does each method of reading a gel break, and does a flag warn of it?
+"""Where does each method of measuring depth and motion of a gel fail, and does a flag report the failure?
 
     python -m experiments stability_fields --data-dir DIR [--scale smoke]
 
 Known motion on pictures of marker gels (generated ones without `--data-dir`), under seven stresses from harmless to
 hopeless: displacement, frame gaps, lost dots, noise, exposure down and up to saturation, contact at the border.  Shear
 is stressed on generated slides, by noise, lost nodes and a layer other than the assumed one; depth on generated presses
-of a ball, by noise, exposure, drifting lamps, contact at the border, too large and too steep.  A method breaks where
-more than 5 % of the points that it gives are a pixel off, where shear errs by more than half of itself or depth by a
-fifth of the press; the curves show where, and whether a flag warned.  Two further tables count flags on real pictures,
+of a ball, by noise, exposure, drifting lamps, contact at the border, too large and too steep.  A method fails if more
+than 5 % of its points are a pixel off, if the error of shear exceeds half of the shear, or that of depth a fifth of the
+press; the curves show where methods fail and whether a flag was set.  Two further tables count flags on real pictures,
 and bare gels taken for marker gels, in every folder of the data directory.  None of the tracker's settings was chosen
 on these pictures, motions or noise.
 
-Six minutes on one core (`smoke` half a minute).  Expected: the package's tracker breaks last and never without a flag;
-methods that match from frame to frame or to the nearest dot break at half a pitch without one.
+Six minutes on one core (`smoke` half a minute).  Expected: the package's tracker fails last and never without a flag;
+methods that match from frame to frame or to the nearest dot fail at half a pitch without a flag.
 """
 
 import dataclasses

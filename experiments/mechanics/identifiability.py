@@ -5,8 +5,8 @@
 All four sensors press generated objects once, 0.3 to 5 N in four frames.  A linear probe on fixed features of pictures,
 fields and force predicts hardness, roughness and protrusion of unseen objects at several multiples of the sensors'
 noise, next to probes that know the true shape or the force alone; its accuracy is a lower bound of the information in
-touch.  Then the probe is trained at other tiers of the contact ladder, on the same presses with the same noise, and
-tested on the exact ones.  Friction and elasticity are predicted from a slide and from a press that is released.
+touch.  Then the probe is trained on the same presses with the same noise from cheaper contact solvers, and tested on
+the exact ones.  Friction and elasticity are predicted from a slide and from a press that is released.
 
 Cost: about seven minutes on two cores (`smoke` two minutes on one).
 

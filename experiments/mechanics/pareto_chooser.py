@@ -1,13 +1,13 @@
-"""Does the chooser meet the error that it promises, and at what cost?
+"""Does the solver's automatic choice of settings (the chooser) meet the requested error, and at what cost?
 
     python -m experiments pareto_chooser [--scale smoke]
 
 Random scenes on all four gels (generated objects, balls, cylinders, rough flats, fine patterns) are solved under every
 setting of the chooser's menu and on a finer and wider reference grid.  Then the chooser solves them for each requested
-error.  Measured are the share of scenes within 1.5 times that error, and its time against the cheapest setting that
-meets the error in hindsight, in interleaved rounds.  The law was fitted to the scenes of "fitted", its margins were
-chosen with those of "chosen" in addition, nothing by those of "unseen"; the run fits the law again.  Last, sequences
-generated with a requested error (`SceneConfig.error`) are checked frame by frame.
+error.  Measures the share of scenes within 1.5 times that error, and the time relative to the cheapest setting that
+meets the error in hindsight, in interleaved rounds.  The error law was fitted to the scenes "fitted", and its margins
+were chosen on "fitted" and "chosen"; the scenes "unseen" were used for nothing.  The run fits the law again.  Finally,
+sequences generated with a requested error (`SceneConfig.error`) are checked frame by frame.
 
 Cost: six minutes on one core (`smoke` a minute).
 

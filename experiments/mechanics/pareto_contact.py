@@ -1,4 +1,4 @@
-"""Which contact method is how fast, and how accurate?
+"""How fast and how accurate is each contact method?
 
     python -m experiments pareto_contact [--scale smoke]
 

@@ -1,4 +1,4 @@
-"""Which friction method is how fast, and how accurate?
+"""How fast and how accurate is each friction method?
 
     python -m experiments pareto_tangential [--scale smoke] [--data-dir DIR]
 

@@ -3,8 +3,8 @@
     python -m experiments stability_contact [--scale smoke]
 
 Runs the failure suite, maps of the error over force and roughness and over force and thickness, and hundreds of
-ordinary scenes.  A frame that errs by more than twice the tolerance against the float64 solution must be flagged, and
-so must a scene to which small-strain theory does not apply; an ordinary good scene must not be.  Adhesion, which no
+ordinary scenes.  A frame must be flagged if its error against the float64 solution exceeds twice the tolerance, or if
+small-strain theory does not apply to its scene; an accurate ordinary scene must not be flagged.  Adhesion, which no
 scene models, is flagged by a threshold for JKR's sphere on a half-space.  Here presses on the layered gels are
 converted to presses with adhesion at equal contact areas (Ciavarella 2018): the flag must be set wherever adhesion
 widens the contact by more than the tolerance.

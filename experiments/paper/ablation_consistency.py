@@ -7,9 +7,9 @@ without the consistency term, with the published one, and with one that counts o
 
 Cost: about 25 minutes on two cores with five seeds; `--scale smoke` under two.
 
-Expected: one level in every slot satisfies the published term (`echo_share` rises, and with it the agreement of
-slots), and the term drives the middle level out, since sensors disagree most about middle objects; the gated term
-should raise the consistency of conclusions (`csc`) without either.
+Expected: the same level in every slot satisfies the published term, so `echo_share` and the agreement of slots rise.
+The term also makes middle answers rare, since sensors disagree most about middle objects.  The gated term should raise
+the consistency of conclusions (`csc`) without these two effects.
 """
 
 from experiments.study.ablation import Ablation, ablation_experiment

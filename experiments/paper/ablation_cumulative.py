@@ -1,13 +1,13 @@
-"""Does each step of the paper's ladder help what it helps there: ordinal credit OMAE, consistency CSC, SFT most?
+"""Does each step of the paper's ablation help what it helps there: ordinal credit OMAE, consistency CSC, SFT most?
 
     make experiment EXP=ablation_cumulative [ARGS="--scale smoke|gpu|paper"]
 
-The arms of Touch-R1's cumulative ablation (arXiv 2605.27154, tables (a) and (b)): the commonest levels, SFT, GRPO with
-0/1 credit, ordinal credit, the consistency reward, the format reward, tactile grounding; and above them the credit for
-the use of touch that only the abstract has.  All arms of GRPO start from the SFT checkpoint of their seed and see the
-same questions in the same order.  Each step is compared with the paper's: its sign, intervals over seeds and objects,
-a p-value over both, corrected for the three primary claims, and where the sign does not come out the known failures
-that the run shows.
+The arms of Touch-R1's cumulative ablation (arXiv 2605.27154, tables (a) and (b)) are the most frequent levels, SFT,
+GRPO with 0/1 credit, ordinal credit, the consistency reward, the format reward and tactile grounding.  A last arm adds
+the credit for the use of touch, which only the abstract of the paper mentions.  All arms of GRPO start from the SFT
+checkpoint of their seed and see the same questions in the same order.  Each step is compared with the paper's by its
+sign, intervals over seeds and objects, and a p-value over both, corrected for the three primary claims.  Where the
+sign differs, the report lists the known failures of the run.
 
 Cost: some 25 minutes of one core with five seeds after `main_table`, whose policies it shares, 60 without; `--scale
 smoke` under two.

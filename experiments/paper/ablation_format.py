@@ -4,13 +4,13 @@
 
 Arms of GRPO from one SFT checkpoint per seed and the same questions: the published reward, the same without the format
 term, half of the weight on format, and the published reward with constrained decoding, under which every rollout is
-formatted.  Evaluation is unconstrained for all.  The end of the report has the seconds of every arm.
+formatted.  Evaluation is unconstrained for all arms.  The end of the report gives the seconds of every arm.
 
 Cost: about 35 minutes on two cores with five seeds; `--scale smoke` under two.
 
-Expected: the accuracy term already takes .1 from an answer that cannot be parsed, and the SFT checkpoint formats nearly
-all answers, so `none` should keep its parse rate, and `heavy` should gain nothing from its weight.  Under a constraint
-no rollout is ever punished for its format, so the policy may forget the format where decoding is free.
+Expected: the accuracy term already subtracts .1 for an answer that cannot be parsed, and the SFT checkpoint formats
+nearly all answers, so `none` should keep its parse rate, and `heavy` should gain nothing from its weight.  Constrained
+rollouts are never penalised for their format, so the policy may forget the format in unconstrained decoding.
 """
 
 from experiments.paper.components import published_without

@@ -4,16 +4,17 @@
     make experiment EXP=ablation_ordinal ARGS="--data physiclear --data-dir DIR"
 
 Three arms of GRPO start from the same SFT checkpoint of each seed and see the same questions in the same order; they
-differ in the reward alone.  `zero_one` pays 1 for the right level, `ordinal` also 0.4 for a neighbour, both with the
+differ only in the reward.  `zero_one` gives 1 for the right level, `ordinal` also 0.4 for a neighbour, both with the
 published consistency term.  `debiased` subtracts from the ordinal credit what a constant answer would earn, so that no
-level is favoured, and pays for consistency only where the answer is right.  All pay −0.1 for an answer that cannot be
+level is favoured, and rewards consistency only where the answer is right.  All give −0.1 for an answer that cannot be
 parsed.  All are compared with the control that continues SFT for as many seconds (`sft_continued`).
 
 Cost: about 25 minutes on two cores of 180 GFLOP/s with five seeds; `--scale smoke` under two.
 
-Expected: ordinal credit pays the middle level for being near everything (answering the middle beats answering low as
-soon as p(low) < p(middle) + 2/3 p(high)), so `ordinal` should give more middle answers than `zero_one`; a lower ordinal
-error that comes from that alone is no better touch.  `debiased` should keep the error without the middle answers.
+Expected: ordinal credit favours the middle level, which is near both others (answering the middle earns more than
+answering low if p(low) < p(middle) + 2/3 p(high)), so `ordinal` should give more middle answers than `zero_one`.  A
+lower OMAE that comes only from middle answers is no better use of touch.  `debiased` should reach the same OMAE without
+more middle answers.
 """
 
 from experiments.paper.components import ZERO_ONE

@@ -2,16 +2,16 @@
 
     make experiment EXP=ablation_tactile_use [ARGS="--scale smoke"]
 
-R_tu pays for answers that score higher with touch than without it.  Arms of GRPO from one SFT checkpoint per seed, the
+R_tu rewards answers that score higher with touch than without it.  Arms of GRPO from one SFT checkpoint per seed, the
 published reward, the same questions: no R_tu, the abstract's literal bonus, added to the reward before normalisation,
 and the recommended one, added to the advantage after it.  Each question is also sampled with the touch dropped, with
 noise, and with another object's touch.
 
 Cost: about 60 minutes on two cores with five seeds (the controls more than double the rollouts); `--scale smoke` two.
 
-Expected: where a group has rewards of two values, right and wrong, division by σ cancels the literal bonus
-(`bonus_cancelled_share` against `bonus_telling_share`) and leaves the recommended one; the curves `touch_score` and
-`control_*` should lie further apart under `recommended` than under `none`.
+Expected: if a group has only two reward values, right and wrong, division by σ cancels the literal bonus
+(`bonus_cancelled_share` and `bonus_telling_share`) but not the recommended one.  The difference between the curves
+`touch_score` and `control_*` should be larger under `recommended` than under `none`.
 """
 
 from experiments.study.ablation import Ablation, ablation_experiment

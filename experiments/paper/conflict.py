@@ -14,8 +14,8 @@ Cost: two minutes of one core after `main_table`, whose policies it evaluates, s
 two.
 
 Expected: the policy without touch follows the picture and is right on few deceptive questions, where it disagrees with
-those of other seeds; the full model is right in more than half of them.  Touch is worth about 35 points over every
-control but the order of the frames of a press, which carries next to no information.
+those of other seeds; the full model is right in more than half of them.  Touch adds about 35 points over every control
+except the order of the frames of a press, which contains almost no information.
 """
 
 import dataclasses

@@ -1,18 +1,18 @@
-"""With few labels, what pays: likelihood, reinforcement, touch without labels, or pretraining?
+"""With few labels, what helps most: SFT, GRPO, touch without labels, or pretraining?
 
     make experiment EXP=few_labels
 
 Policies are trained with 10, 30, 100, 300 and all labelled contacts, from a random encoder and from one that stage 1
 has pretrained on the touch of all training objects: by SFT end to end (`sft`), or in two phases, of the encoders by a
-linear head and of the decoder (`two_phases`), and from there by GRPO on the labelled contacts (`grpo`), GRPO that also
-asks about unlabelled contacts and pays the level that most sensors alone agree on (`agreement`), and GRPO that pays the
-level that measured physics implies (`physics`): hardness from the slope of force over indentation, roughness from
-friction force over load where a contact slides.  All are scored once on test objects.
+linear head and of the decoder (`two_phases`).  From there, GRPO trains on the labelled contacts (`grpo`); GRPO also
+asks about unlabelled contacts and rewards the level on which most single sensors agree (`agreement`); or GRPO rewards
+the level that measured physics implies (`physics`): hardness from the slope of force over indentation, roughness from
+friction force over load where a contact slides.  All policies are scored once on test objects.
 
 Cost: about half an hour on two cores; `--scale smoke` under two minutes.
 
-Expected: every tenfold number of labels brings more than any method; label-free terms can pay only where the agreed or
-measured level is right more often than the policy, and the report shows how often it is.
+Expected: ten times as many labels help more than any method.  Label-free terms can help only where the agreed or
+measured level is right more often than the policy; the report shows how often it is right.
 """
 
 import dataclasses

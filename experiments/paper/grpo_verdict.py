@@ -1,18 +1,18 @@
-"""Does reinforcement make a tactile policy better than likelihood alone?
+"""Does GRPO make a tactile policy better than SFT alone?
 
     make experiment EXP=grpo_verdict
 
-All arms start from one policy of each seed that SFT has trained in both phases, and are trained on the same encoded
-contacts, about all properties, half of the questions with a part of the sensors, anchored by the likelihood of the
-verified answers.  They differ in the conclusion (sampled, or enumerated with its exact gradient), in the prompts of a
-step (8 or 64) and in the algorithm (DAPO, GSPO, CISPO, leave-one-out).  The control continues SFT of the decoder for as
-many seconds.  Rates are chosen for each arm on validation objects, with the first seed; everything is scored once, on
-objects of another scene seed.
+For each seed, all arms start from the same policy, which both phases of SFT have trained.  They train on the same
+encoded contacts and on all properties; half of the questions use only a part of the sensors, and the likelihood of the
+verified answers is a term of the objective.  Arms differ in the conclusion (sampled, or enumerated with its exact
+gradient), in the prompts of a step (8 or 64) and in the algorithm (DAPO, GSPO, CISPO, leave-one-out).  The control
+continues SFT of the decoder for as many seconds.  Learning rates are chosen for each arm on validation objects, with
+the first seed.  All policies are scored once, on objects of another scene seed.
 
 Cost: about half an hour on two cores; `--scale smoke` under two minutes.
 
-Expected: with a label for every object nothing beyond chance in accuracy; agreement of single sensors is where
-reinforcement without an anchor lost most.
+Expected: with a label for every object, no significant difference in accuracy.  Without an anchor, GRPO lowered the
+agreement of single sensors most.
 """
 
 import dataclasses

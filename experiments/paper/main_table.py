@@ -2,20 +2,20 @@
 
     make experiment EXP=main_table [ARGS="--scale smoke|gpu|paper"]
 
-The bench's questions (see `dataset_card`) about the test objects of a study: properties of a touch, several at once,
-comparisons and orders, single sensors, and objects that look like others.  Answered by the full model (published
-rewards and grounding), by SFT alone, by SFT continued for as many seconds as GRPO takes, and by baselines: constants,
-the measured force, the picture alone by a probe and by a policy that was trained without touch, the nearest training
-contacts by their fields, a linear probe on the encoder of SFT, and the same probe when every contact has another
-object's touch.  Policies and baselines answer about one touch at a time; comparisons follow from these answers (see
+The bench's questions (see `dataset_card`) about the test objects of a study cover properties of a touch, several
+properties at once, comparisons and orders, single sensors, and objects with misleading pictures.  The full model
+(published rewards and grounding), SFT alone and SFT continued for as many seconds as GRPO takes answer them.  Baselines
+are constants, the measured force, the picture alone (a probe, and a policy trained without touch), the nearest training
+contacts by their fields, a linear probe on the encoder of SFT, and the same probe with another object's touch.
+Policies and baselines answer about one touch at a time; comparisons are computed from these answers (see
 `experiments.paper.bench_scores`).
 
 Cost: about 45 minutes on two cores with five seeds; the other studies of the bench reuse its policies. `--scale
 smoke` under two.
 
-Expected: touch is worth over thirty points over every baseline without it; SFT stays one to two points behind a linear
-probe on its own encoder, and GRPO adds nothing to SFT that is continued for as long.  Baselines without touch stay near
-chance in comparisons.  A constant already has an average of about 28.
+Expected: touch adds over thirty points to every baseline without it.  SFT is one to two points below a linear probe on
+its own encoder, and GRPO is no better than SFT that is continued for as long.  Baselines without touch are near chance
+in comparisons.  A constant has an average of about 28.
 """
 
 import dataclasses

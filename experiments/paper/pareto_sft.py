@@ -1,15 +1,15 @@
-"""Into which phase of training do seconds go best: the encoders, the decoder on encoded contacts, or both end to end?
+"""Which phase of training gains most per second: the encoders, the decoder on encoded contacts, or both end to end?
 
     make experiment EXP=pareto_sft [ARGS="--scale smoke"]
 
-The encoders are trained by a linear head, or with the decoder end to end, for several numbers of steps, and from each
-of these policies the decoder alone, on schedules of several lengths.  Every policy answers all questions about the
-validation objects, on which the lengths of the studies are chosen; no test object is read.  Seconds are those of the
-steps themselves, without compilation.
+The encoders are trained with a linear head, or with the decoder end to end, for several numbers of steps.  From each of
+these policies, the decoder alone is trained on schedules of several lengths.  Every policy answers all questions about
+the validation objects, on which the lengths of the studies are chosen; no test object is read.  Seconds exclude
+compilation.
 
 Cost: about half an hour of one core with one seed; `--scale smoke` under two minutes.
 
-Expected: a step of the encoders' head teaches them more than a step end to end, at a fraction of its cost.
+Expected: a step with the linear head improves the encoders more than a step end to end, at a fraction of its cost.
 """
 
 import dataclasses

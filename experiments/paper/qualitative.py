@@ -2,16 +2,16 @@
 
     make experiment EXP=qualitative [ARGS="--scale smoke|gpu|paper"]
 
-A browser of rollouts over the bench: frames, forces, fields at the strongest press, the trace with its parsed slots,
-the reward term by term, and next to it the answers of the same policy without its touch, with noise, with another
-object's touch, with the frames in another order, and those of SFT and of a policy without touch.  Cases and items are
-chosen by rule, not by hand: the rules see answers and labels alone, and the first that fit in the order of the data are
-shown, one of each object.  A table says how common each case is, which examples cannot.
+A browser of rollouts over the bench shows frames, forces, fields at the strongest press, the trace with its parsed
+slots, and each term of the reward.  Next to them are the answers of the same policy without touch, with noise, with
+another object's touch and with the frames in another order, and the answers of SFT and of a policy trained without
+touch.  Rules select cases and items from answers and labels only: the first matches in the order of the data are shown,
+one per object.  A table gives the frequency of each case.
 
 Cost: a minute of one core after `main_table`, whose policy it evaluates, seven without; `--scale smoke` under one.
 
-Expected: right answers become wrong with another object's touch; where a picture misleads a policy without touch,
-touch overrules it in about half of the questions (`conflict`), about the material least often.
+Expected: right answers become wrong with another object's touch.  Where a picture misleads a policy without touch,
+touch corrects about half of the answers (`conflict`), least often those about material.
 """
 
 import dataclasses

@@ -1,11 +1,11 @@
-"""What does a larger policy gain: accuracy and ordinal error of three sizes against parameters and seconds?
+"""What does a larger policy gain: accuracy and OMAE of three sizes against parameters and seconds?
 
     make experiment EXP=scaling [ARGS="--scale smoke|gpu"]
 
-The same study three times: a tactile encoder, picture tower and decoder of .43, 1 and 2.1 times the default's
-parameters, as 3 and 14 billion are of 7 in the paper's figure.  Every size is trained by SFT and by GRPO with the
-published rewards and grounding, on the same scenes, questions and seeds, and answers the bench's questions about the
-test objects; so does a policy of its size without touch.  Learning rates and steps are the default size's.
+The same study with a tactile encoder, picture tower and decoder of .43, 1 and 2.1 times the default's parameters, the
+ratios of 3, 7 and 14 billion in the paper's figure.  SFT and GRPO, with the published rewards and grounding, train
+every size on the same scenes, questions and seeds.  The policies, and policies of the same size without touch, answer
+the bench's questions about the test objects.  Learning rates and steps are those of the default size.
 
 Cost: some 45 minutes of one core with three seeds and their data, GRPO shortened to a third; the default size's SFT is
 shared with other experiments; `--scale smoke` under one minute.

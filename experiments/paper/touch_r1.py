@@ -5,38 +5,38 @@
     make experiment EXP=touch_r1 ARGS="--scale small|smoke|smoke_qwen3"
 
 DIR holds a released Qwen2.5-VL or dense Qwen3-VL: config, tokenizer, chat template, picture settings and safetensors
-(see `python -m touchr1_jax.models.load DIR`).  A tactile encoder of our own is added to its towers, which are frozen:
-SFT trains the encoder and low-rank adapters on verified answers, GRPO with the published rewards and the
-counterfactual KL trains the same adapters on.  They are never merged: what is scored, continued and written is the
-released weights with adapters beside them, so that no change is lost to the weights' type.  `--lora.targets` names
+(see `python -m touchr1_jax.models.load DIR`).  The experiment freezes its towers and adds a tactile encoder.
+SFT trains the encoder and low-rank adapters on verified answers; GRPO with the published rewards and the
+counterfactual KL continues to train the adapters.  The adapters are never merged into the released weights during
+scoring, resuming or saving, because rounding to the weights' type would lose small changes.  `--lora.targets` names
 the adapted layers of the decoder, `--lora.vision-targets` those of the vision tower, `--lora.rank-stabilised` scales
 by rsLoRA.  The policy is scored on unseen objects and compared with the released model, which sees the picture and no
 touch, with the same training without touch, and with constants; it is evaluated again under each control of touch.
-It is written to `policies/NAME/SEED` of the run, adapters in PEFT's format, and evaluated again from there; `python
--m experiments ask RUN/touch_r1/0 INPUT` asks it about new data, `python -m experiments export` merges it into whole
-weights.
+The run saves it in `policies/NAME/SEED`, with adapters in PEFT's format, and evaluates it again from there.
+`python -m experiments ask RUN/touch_r1/0 INPUT` asks it about new data;
+`python -m experiments export RUN/touch_r1/0 FOLDER` merges it into whole weights.
 
-`--scale smoke` makes a tiny checkpoint of the released format where none is given, `smoke_qwen3` one of Qwen3-VL's: it
-tries the code, and its figures mean nothing.  With its drawn embeddings, which are frozen, no decoder can give the
-right token a probability above 0.8 %: greedy answers parse, and GRPO samples noise.  `--scale small` first teaches such
-a checkpoint to write answers, without touch or pictures, and then trains it: without released weights one can watch the
-training learn.
+`--scale smoke` makes a tiny checkpoint of the released format if none is given, `smoke_qwen3` one of Qwen3-VL.  Both
+test the code, and their figures mean nothing.  With their random, frozen embeddings, no decoder can give the
+right token a probability above 0.8 %: greedy answers parse, and GRPO samples noise.  `--scale small` first trains such
+a checkpoint to write answers, without touch or pictures, and then trains it on touch: it shows that training works
+without released weights.
 
-`--rollouts.url http://HOST:8000` lets a vLLM server of the same weights draw the rollouts of GRPO (README of
-`touchr1_jax`); prompts' tokens are then numbered one by one, in all stages, as such a server does.
+With `--rollouts.url http://HOST:8000`, a vLLM server with the same weights samples the rollouts of GRPO (README of
+`touchr1_jax`); all stages then number the tokens of a prompt consecutively, as the server does.
 
-Pictures stay on disk: batches are read ahead by `--read-threads`, and the time that steps wait for them is logged.
+Pictures stay on disk: `--read-threads` threads prefetch batches, and the log shows how long steps wait for them.
 Several devices: `--distributed --mesh.fsdp N` as in every study, with `--grpo.micro-prompts` a multiple of N; each
-process reads the whole weights first.
+process first reads all weights.
 
-Cost: not measured, for neither such weights nor such a machine were at hand; sized for the 3B or 7B on one H200, of
-which GRPO holds 28 or 52 GB by the count that every run makes ahead.  `--scale smoke` under two minutes; `--scale
+Cost: not measured, because neither such weights nor such a machine were available; sized for the 3B or 7B on one H200,
+where GRPO needs 28 or 52 GB by the count at the start of every run.  `--scale smoke` under two minutes; `--scale
 small` 24 of one core, of which scenes and teaching take 4 each.
 
-Expected: the released model without touch near the constant, and much above it after SFT; from GRPO what the paper's
-ladder has (`ablation_cumulative`), of which small policies show only a part.  At `small` the loss of SFT does not fall
-for 500 steps; of ordinal questions about unseen objects 60 % are then answered right, 61 % after GRPO,
-26 % by the checkpoint that writes and never had touch, 36 % after the same training without touch, 34 % by a constant.
+Expected: the released model without touch is near the constant, and SFT is much better; GRPO gains what the paper
+reports (`ablation_cumulative`), of which small policies show only a part.  At `small`, the loss of SFT does not fall
+for 500 steps.  Of the ordinal questions about unseen objects, SFT then answers 60 % right, GRPO 61 %, the checkpoint
+before training on touch 26 %, the same training without touch 36 %, and a constant 34 %.
 """
 
 import dataclasses

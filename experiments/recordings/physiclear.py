@@ -3,17 +3,17 @@
     python -m experiments physiclear --data-dir DIR [--scale smoke]
     python -m experiments physiclear --predict VIDEO [VIDEO ...] --out PRED.json [--policy RUN/policy.npz]
 
-PhysiCLeAR (Yu et al., Octopi, RSS 2024): GelSight Mini videos of objects pressed and turned by hand; hardness,
-roughness and bumps of 67 of them, three levels each, judged by people.  Ten-fold cross-validation, no object in two
-folds, on eight partitions; intervals over objects.  Settings were chosen on the partitions 101 to 108 of the same
-objects, and the ablations and curves stand on 101.  Where the folder holds ratings.json, targets are half the label,
-half the probability of each level given what people said of the object (training objects alone).  The policy that is
-kept learns from all labelled objects; `--predict` answers with it, in words with probabilities: a folder of videos one
-by one, several named videos also together, as touches of one object.
+PhysiCLeAR (Yu et al., Octopi, RSS 2024): GelSight Mini videos of objects pressed and turned by hand.  People labelled
+hardness, roughness and bumps of 67 objects on three levels.  Ten-fold cross-validation by object on eight partitions;
+intervals over objects.  Settings were chosen on the partitions 101 to 108 of the same objects; ablations and curves use
+partition 101.  If the folder contains ratings.json, a target is the mean of the label and of the probability of each
+level given people's ratings of the object (training objects only).  The saved policy learns from all labelled objects.
+`--predict` answers with it, in words with probabilities: each video of a folder separately, several named videos also
+together, as touches of one object.
 
-Under a load of 15 on two cores: 30 minutes for scenes, once, 15 for the rest (`smoke` half a minute).  Expected: all
-three right of 44 % of the videos, 72 % of the levels, .32 levels off from one video, 50 %, 76 % and .27 from all of an
-object; people agree with 75 to 79 % of the labels that they rated.
+Under a load of 15 on two cores: 30 minutes for scenes, once, 15 for the rest (`smoke` half a minute).  Expected: from
+one video, all three levels right for 44 % of the videos, 72 % of the levels right, OMAE .32; from all videos of an
+object 50 %, 76 % and .27.  People agree with 75 to 79 % of the labels that they rated.
 """
 
 import dataclasses

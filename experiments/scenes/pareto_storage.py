@@ -9,9 +9,9 @@ frames written and read a second, on one core, in interleaved rounds.  A codec c
 Then measures the feed: the time of each part of making a clip, the cost of each augmentation, and the rate with reading
 processes.
 
-The rule for the default, set in advance: of the codecs that read what training needs (1600 frames a second: clips of 8
-frames of 4 sensors, 50 a second) on at most 15 % of a core, generated and as imported, the one of fewest bytes in the
-mean of their ratios to raw frames.
+The rule for the default was set in advance.  Training needs 1600 frames a second (50 clips of 8 frames of 4 sensors).
+Of the codecs that read them on at most 15 % of a core, for generated and imported frames, the rule selects the codec
+with the lowest mean ratio of bytes to raw frames.
 
 Cost: four minutes on one core; `--scale smoke` under one, without recordings.
 

@@ -1,12 +1,12 @@
 """What do a billion generated records cost, and what limits them on 1, 10, 100 and 1,000 machines?
 
     python -m experiments scale_records
-    python -m experiments scale_records --hourly-price 0.8 --bandwidth-gb-s 0.5      (your machines)
+    python -m experiments scale_records --machine.hourly-price 0.8 --machine.bandwidth-gb-s 0.5      (your machines)
 
-Units are measured here: the time of a core and the bytes of a record, the requests of a shard on its way to a store and
-back, and the index of 10⁴ and 10⁷ contacts.  The page multiplies them by the counts of a billion records, which cannot
-be made here: every figure of its last two tables is simulated from measured units and from the assumed machine of the
-configuration, and says so.  The driver adopts one shard after the other, so that its time does not fall with machines.
+Measures the CPU time and the bytes of a record, the requests to write a shard to a store and to read it, and the index
+of 10⁴ and 10⁷ contacts.  The report multiplies them by the counts of a billion records: all figures of its last two
+tables are marked as simulated, from measured units and from the assumed machine of the configuration.  The driver adds
+one shard after the other to the index, so that its time does not fall with the number of machines.
 
 Cost: about six minutes on one core, half of it the index; `--scale smoke` one minute.
 

@@ -8,7 +8,7 @@ with a table of the levels of each property by material.
 
 Cost: under two minutes on two cores.
 
-Expected: the pictures are to be looked at; a level predicted from the material alone is right for half of the objects.
+Expected: a level predicted from the material alone is right for half of the objects; the pictures are for inspection.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""Can one laptop make a million four-sensor records with physics, as a feed or written, and resume when killed?
+"""Can one laptop make a million four-sensor records with physics, in memory or on disk, and resume when killed?
 
     python -m experiments throughput_scenes
     python -m experiments throughput_scenes --scale full      (feeds all 1.32 million records: about twenty minutes)

@@ -3,9 +3,9 @@
     main(["small_grpo"], package="experiments.faults.trainings")
 
 The GRPO stage of every study, shortened: its questions in Grain's order, the published objective with its reference and
-counterfactual pass, its log with alarms, a checkpoint every few steps, the newest and the best on held-out questions
-kept.  The policy is small and the contacts are drawn encoded, so that a session starts in seconds and can be killed by
-the hundred.
+counterfactual pass, its log with alarms, and a checkpoint every few steps; the newest and the best on validation
+questions are kept.  The policy is small and the encoded contacts are random, so that a session starts in seconds and
+can be killed hundreds of times.
 """
 
 import dataclasses

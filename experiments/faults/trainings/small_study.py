@@ -3,8 +3,8 @@
     main(["small_study"], package="experiments.faults.trainings")
 
 The run that `stability_faults` kills: SFT, GRPO and a baseline without touch, as every study trains them, with networks
-so small that most of a step is the loop around it.  A checkpoint every few steps, so that many kills strike one being
-written.
+so small that the loop takes most of the time of a step.  A checkpoint is written every few steps, so that many kills
+interrupt one.
 """
 
 import dataclasses
