@@ -276,9 +276,13 @@ class SeedTraining(StudySeed):
             params, contacts, validation = self._start()
             test = self.encode(params, "test")
             self._evaluate_all(SFT, params, test, contacts.noise)
-            for name in (CONTINUED, *self.arms):
+            others = (CONTINUED, *self.arms)
+            first = self.seed % len(others)  # seeds that are trained at the same time compile different programs
+            for name in others[first:] + others[:first]:
                 self._evaluate_all(name, self._continue(name, params, contacts, validation), test, contacts.noise)
-            self._evaluate(BLIND, self._blind)
+            blind = self._train_blind()
+            unfelt = self.encode(blind, "test", blind=True)
+            self._evaluate(BLIND, lambda: self.ask(blind, unfelt, samples=self.config.samples))
         return {name: load_answers(self._path(name)) for name in names}
 
     def train(self, name: str) -> None:
@@ -306,10 +310,6 @@ class SeedTraining(StudySeed):
 
     def _train_blind(self) -> Params:
         return self.run_sft(self.config.blind, "blind", blind=True)
-
-    def _blind(self) -> Evaluation:
-        params = self._train_blind()
-        return self.ask(params, self.encode(params, "test", blind=True), samples=self.config.samples)
 
     def _evaluate_all(self, name: str, params: Params, test: Features, noise: Array) -> None:
         """Save and evaluate a policy, then evaluate all variants of it."""

@@ -25,6 +25,7 @@ from touchr1_jax.rl.rollout import (
     sample_with_caches,
 )
 from touchr1_jax.text.template import level_tokens
+from touchr1_jax.training.compilation import committed
 from touchr1_jax.training.questions import equal_blocks, labelled_questions, question_batch
 from touchr1_jax.types import Params, Parsed
 
@@ -94,7 +95,7 @@ def evaluate_policy(
     shown = [present]
     if alone and present.any() and s > 1:
         shown += [present & (np.arange(s) == i) for i in range(s)]
-    answer, decoder = answer or answer_program(policy), of_decoder(params)
+    answer, decoder = answer or answer_program(policy), committed(of_decoder(params))
     rounds: list[tuple[np.ndarray, Callable[[GRPOBatch, int], Any]]]
     rounds = [(streams, lambda batch, block: answer(decoder, batch)) for streams in shown]
     if samples:
