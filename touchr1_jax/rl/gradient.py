@@ -25,10 +25,6 @@ from touchr1_jax.rl.losses import TokenTerms, divisor, grpo_loss, token_log_prob
 from touchr1_jax.rl.rollout import GRPOBatch, drawn_log_probs, tempered, truncates
 from touchr1_jax.types import Params, Rollout
 
-LEAST_SAVED = 0.1
-"""Least share of the perturbed policy's tokens that branches must save: each takes some seconds to compile."""
-
-
 class Experience(NamedTuple):
     """Rollouts and what an update needs to learn from them; every field has a leading P.
 
@@ -251,9 +247,8 @@ def perturbed_states(
 ) -> Any:
     """Hidden states of the completions under perturbed touch.
 
-    Only what follows the perturbed stream's first token is encoded again: for a single prompt exactly that, by a branch
-    for each stream.  What follows the first stream's is encoded for a batch of prompts, whose branches would all be
-    computed, and where branches save less than `LEAST_SAVED` of the tokens, for each of them is compiled.
+    Only what follows the perturbed stream's first token is encoded again: for a single prompt exactly that, for a
+    batch of prompts, whose branches would all be computed, what follows the first stream's.
 
     Args:
       prefix: the prompt as the policy encodes it.
@@ -266,9 +261,7 @@ def perturbed_states(
     def again(start: int, p: Params) -> Any:
         return states(p, features, known, start)[0]
 
-    computed = experience.batch.ids.shape[-1] - min(starts) + experience.rollout.tokens.size
-    saved = sum(starts) / len(starts) - min(starts)
-    if config.micro_prompts > 1 or saved < LEAST_SAVED * computed:
+    if config.micro_prompts > 1:
         return again(min(starts), own)
     return jax.lax.switch(experience.masked_stream, [functools.partial(again, start) for start in starts], own)
 
