@@ -25,6 +25,7 @@ from touchr1_jax.rl.losses import TokenTerms, divisor, grpo_loss, token_log_prob
 from touchr1_jax.rl.rollout import GRPOBatch, drawn_log_probs, tempered, truncates
 from touchr1_jax.types import Params, Rollout
 
+
 class Experience(NamedTuple):
     """Rollouts and what an update needs to learn from them; every field has a leading P.
 
