@@ -8,10 +8,10 @@ of 10⁴ and 10⁷ contacts.  The report multiplies them by the counts of a bill
 tables are marked as simulated, from measured units and from the assumed machine of the configuration.  The driver adds
 one shard after the other to the index, so that its time does not fall with the number of machines.
 
-Cost: about six minutes on one core, half of it the index; `--scale smoke` one minute.
+Cost: about two and a half minutes on one core, half of it the index; `--scale smoke` one minute.
 
-Expected: some 300 hours of a core and 27 TB.  The driver waits for its disk with each shard, so that it limits first;
-larger shards move that limit.
+Expected: some 750 hours of a core and 17 TB.  Computation limits on up to 100 machines and the driver,
+which waits for its disk with each shard, on 1,000; larger shards move that limit.
 """
 
 import collections
