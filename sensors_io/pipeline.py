@@ -60,6 +60,8 @@ class ClipMemory:
 
     def __init__(self, config: ClipConfig, most_bytes: int) -> None:
         self.config = config
+        self.contacts: Contacts | None = None
+        """Whose clips they are: of those that are read first."""
         self._most, self._held = most_bytes, 0
         self._clips: dict[tuple[int, bool], dict[str, np.ndarray]] = {}
         self._lock = threading.Lock()
@@ -191,7 +193,7 @@ def clip_batches(
       SchemaError: no contact, or one that the store does not hold; a memory for other clips or beside `workers`; rows
         that a batch does not have.
     """
-    _check_memory(memory, config, workers)
+    _check_memory(memory, store, config, workers)
     rows = _checked_rows(indices, len(store))
     dataset = grain.MapDataset.source(rows).seed(seed)
     dataset = dataset.shuffle() if shuffle else dataset
@@ -267,8 +269,17 @@ def _checked_own(own: Any, batch_size: int, whole: bool) -> list[int]:
     return rows
 
 
-def _check_memory(memory: ClipMemory | None, config: ClipConfig, workers: int) -> None:
-    if memory is not None and (memory.config != config or workers):
+def _check_memory(memory: ClipMemory | None, store: Contacts, config: ClipConfig, workers: int) -> None:
+    if memory is None:
+        return
+    if memory.contacts is None:
+        memory.contacts = store
+    if memory.contacts is not store:
+        raise SchemaError(
+            f"memory keeps clips of {memory.contacts}: the contacts are those of {store}, with the same numbers; make "
+            "a memory for them"
+        )
+    if memory.config != config or workers:
         raise SchemaError(
             f"memory keeps {memory.config} of one process: the clips are {config}, read by {workers} worker processes; "
             "make it for these clips and leave workers at 0"

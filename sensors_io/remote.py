@@ -24,6 +24,7 @@ from sensors_io.codec import RecordsError
 CACHE, CACHE_GB = "TOUCHR1_CACHE", "TOUCHR1_CACHE_GB"
 """Variables of the environment: folder of the cache, by default ~/.cache/touchr1, and its size, by default 50 GB."""
 
+_COPY = re.compile(r"[0-9a-f]{24}-.+")  # name of a copy in the cache; nothing else is ever removed from its folder
 _URL = re.compile(r"([a-z][a-z0-9+]+):/+(.+)")  # one slash is left where a URL was made a path
 _LOG = logging.getLogger(__name__)
 _SLOW_S = 10.0  # from which on a line says that a request is waited for
@@ -85,11 +86,16 @@ class Mirror:
         state = [str(about.get(key)) for key in ("ETag", "etag", "md5Hash", "size", "LastModified", "created", "mtime")]
         named = hashlib.sha256("\0".join([self.url, name, *state]).encode()).hexdigest()[:24]
         path = self._cache / f"{named}-{name.rpartition('/')[2]}"
-        if not path.exists():
-            self._cache.mkdir(parents=True, exist_ok=True)
-            self._download(name, path, about["size"])
-        os.utime(path)  # the one that was not read for the longest time goes first
-        return path
+        try:
+            while True:
+                if not path.exists():
+                    self._cache.mkdir(parents=True, exist_ok=True)
+                    self._download(name, path, about["size"])
+                with contextlib.suppress(FileNotFoundError):  # another process needed the room just now
+                    os.utime(path)  # the one that was not read for the longest time goes first
+                    return path
+        except PermissionError as error:
+            raise StoreError(f"the cache {self._cache} cannot be written ({error}): set {CACHE} to a folder") from error
 
     def fetch_ahead(self, files: Iterable[tuple[str, int]]) -> None:
         """Begin to copy files, names and sizes, in their order beside the caller, as many as the cache holds."""
@@ -124,9 +130,9 @@ class Mirror:
                 temporary.unlink(missing_ok=True)
 
     def _make_room(self, size: int) -> None:
-        """Remove what was not read for the longest time until `size` bytes more keep within the bound."""
+        """Remove the copies that were not read for the longest time until `size` bytes more keep within the bound."""
         files = []
-        for file in self._cache.iterdir():
+        for file in filter(lambda file: _COPY.fullmatch(file.name), self._cache.iterdir()):
             with contextlib.suppress(FileNotFoundError):  # another process removes as well
                 files.append((file.stat().st_mtime, file.stat().st_size, file))
         held = sum(bytes_ for _, bytes_, _ in files)

@@ -99,6 +99,7 @@ def finish(units: Sequence[WorkUnit], launcher: Launcher, say: Callable[[str], o
     Raises:
       LauncherError: before anything is computed.
       UnitsError: after all the others are done.
+      Exception: of a unit that this process runs itself, at once.
     """
     done = [unit.done() for unit in units]
     yield from itertools.compress(units, done)
@@ -113,7 +114,11 @@ def finish(units: Sequence[WorkUnit], launcher: Launcher, say: Callable[[str], o
 
 def _run(units: Sequence[WorkUnit], launcher: Launcher, say: Callable[[str], object]) -> Iterator[WorkUnit]:
     before = signal.getsignal(signal.SIGTERM)
-    died, submit, close = _ENGINES[launcher.engine](launcher)  # Ray takes the signal
+    try:
+        died, submit, close = _ENGINES[launcher.engine](launcher)  # Ray takes the signal
+    except BaseException:
+        signal.signal(signal.SIGTERM, before)
+        raise
     signal.signal(signal.SIGTERM, signal.default_int_handler if before is signal.SIG_DFL else before)
     size = -(-len(units) // launcher.workers) if launcher.engine == "slurm" else 1  # a job compiles once for its share
     groups = [tuple(units[i : i + size]) for i in range(0, len(units), size)]

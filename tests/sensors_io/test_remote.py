@@ -2,6 +2,7 @@
 
 import errno
 import hashlib
+import os
 import pathlib
 import threading
 
@@ -87,6 +88,47 @@ def test_the_cache_keeps_within_its_bound(records, cache, monkeypatch):
     for i in [*range(7), *range(7)]:
         assert store.contact(i)["xense"].key == store.contacts[i]
         assert sum(path.stat().st_size for path in cache.iterdir()) <= most
+
+
+def test_the_cache_removes_its_own_copies_alone(records, cache, monkeypatch):
+    """Files of the user, folders and downloads of other processes stay, however old and large they are."""
+    assert main(["push", str(records), URL]) == 0
+    (cache / "photos").mkdir(parents=True)
+    others = [cache / "thesis.tex", cache / "photos" / "gel.png", cache / f".{'0' * 24}-index.json.tmp"]
+    for path in others:
+        path.write_bytes(bytes(10**5))
+        os.utime(path, (1, 1))
+    monkeypatch.setenv(remote.CACHE_GB, "1e-6")
+    monkeypatch.setattr("sensors_io.shards._OPEN", 1)
+    store = RecordStore(URL)
+    for i in range(7):
+        assert store.contact(i)["xense"].key == store.contacts[i]
+    assert all(path.stat().st_size == 10**5 for path in others)
+
+
+def test_a_copy_that_another_process_removes_is_made_again(records, cache, monkeypatch):
+    assert main(["push", str(records), URL]) == 0
+    removed, touch = [], os.utime
+
+    def late(path, *times):
+        if not removed:
+            removed.append(pathlib.Path(path).unlink())
+        touch(path, *times)
+
+    monkeypatch.setattr(remote.os, "utime", late)
+    assert Mirror(URL).fetch("index.json").read_bytes() == (records / "index.json").read_bytes()
+    assert removed
+
+
+def test_a_cache_that_cannot_be_written_is_named_and_no_credentials(records, tmp_path, monkeypatch):
+    assert main(["push", str(records), URL]) == 0
+
+    def denied(path, *args, **kwargs):
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setenv(remote.CACHE, str(tmp_path / "locked"))
+    monkeypatch.setattr(pathlib.Path, "mkdir", denied)
+    refused(StoreError, "locked cannot be written .* set TOUCHR1_CACHE", lambda: Mirror(URL).fetch("index.json"))
 
 
 def test_what_was_replaced_at_the_url_is_read_anew(records, tmp_path):

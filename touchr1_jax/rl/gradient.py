@@ -25,6 +25,9 @@ from touchr1_jax.rl.losses import TokenTerms, divisor, grpo_loss, token_log_prob
 from touchr1_jax.rl.rollout import GRPOBatch, drawn_log_probs, tempered, truncates
 from touchr1_jax.types import Params, Rollout
 
+GROUNDING, PERTURBED = "grounding_stream_", "perturbed_stream_"
+"""Metrics of each stream, followed by its number: mean G of the prompts in which it was perturbed, and their number."""
+
 
 class Experience(NamedTuple):
     """Rollouts and what an update needs to learn from them; every field has a leading P.
@@ -137,8 +140,8 @@ def _grounding_by_stream(grounding: Float[Array, "P"], experience: Experience) -
     found = {}
     for s in range(streams.shape[1]):
         perturbed = (experience.masked_stream == s) & streams[:, s]
-        found[f"grounding_stream_{s}"] = masked.mean(grounding, perturbed)
-        found[f"perturbed_stream_{s}"] = jnp.sum(perturbed).astype(jnp.float32)
+        found[f"{GROUNDING}{s}"] = masked.mean(grounding, perturbed)
+        found[f"{PERTURBED}{s}"] = jnp.sum(perturbed).astype(jnp.float32)
     return found
 
 

@@ -48,7 +48,7 @@ from touchr1_jax.rl.metrics import (
     touch_metrics,
 )
 from touchr1_jax.rl.rollout import GRPOBatch, SampleConfig, encode_prompts, sample_prompts
-from touchr1_jax.rl.scoring import ScoreFn, WeightedScore, left_out_groups
+from touchr1_jax.rl.scoring import ScoreFn, WeightedScore, left_out_groups, neutralised
 from touchr1_jax.rl.update import update_policy
 from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.text.template import LevelTokens
@@ -150,8 +150,8 @@ def make_grpo_step(
 
     Raises:
       ValueError: an algorithm that samples constrained, without a constraint; one that enumerates conclusions, without
-        the tokens of the levels; one that credits segments, with a score
-        that `make_score` did not make; lean compilation where jax has none.
+        the tokens of the levels; one that credits segments, with a score that `make_score` did not make; lean
+        compilation where jax has none.
     """
     if config.lean_compilation and not compiles_leanly():
         raise ValueError(
@@ -276,11 +276,17 @@ class GRPOEngine:
         return equal | ~group.finite
 
     def penalised(self, group: Group, reference: Params) -> Group:
-        """The group with −β Σ_t log(π/π_ref) as a further term of its reward: the unbiased estimate k1 of the KL."""
+        """The group with −β Σ_t log(π/π_ref) as a further term of its reward: the unbiased estimate k1 of the KL.
+
+        Groups that are left out, also for this term, again have the mean of all others.
+        """
         rollout = group.rollout
         log_ref = log_probs(self.fns, self.config, reference, group.batch, rollout)
         term = -self.config.algorithm.beta * masked.total(rollout.log_prob - log_ref, rollout.mask, -1)
-        return group._replace(reward=group.reward + term, terms={**group.terms, "kl": term})
+        finite = group.finite & jnp.all(jnp.isfinite(term), -1)
+        neutral = functools.partial(neutralised, finite=finite)
+        reward, terms = jax.tree.map(neutral, (group.reward + term, {**group.terms, "kl": term}))
+        return group._replace(reward=reward, terms=terms, finite=finite)
 
     def perturbed(self, batch: Any, frozen: Any, key: Array) -> tuple[Array, Int[Array, "P"]]:
         """Touch of which one stream of each prompt is noise, for the grounding term, and which stream."""

@@ -88,6 +88,11 @@ class WeightedScore:
         return segment_advantages(algorithm, reward, terms, settled, segment)
 
 
+def neutralised(x: Float[Array, "D G"], finite: Bool[Array, "D"]) -> Float[Array, "D G"]:
+    """Numbers of rollouts, those of groups that are not finite replaced by the mean of all others."""
+    return jnp.where(finite[:, None], x, masked.mean(x, jnp.broadcast_to(finite[:, None], x.shape)))
+
+
 def left_out_groups(
     reward: Float[Array, "D G"], terms: Mapping[str, Float[Array, "D G"]]
 ) -> tuple[Float[Array, "D G"], dict[str, Float[Array, "D G"]], Bool[Array, "D"], dict[str, Float[Array, ""]]]:
@@ -101,7 +106,7 @@ def left_out_groups(
     by_term = {name: is_finite(term) for name, term in terms.items()}
     all_terms = functools.reduce(jnp.logical_and, by_term.values(), jnp.ones(reward.shape[:1], bool))
     finite = all_terms & is_finite(reward)
-    neutral = lambda x: jnp.where(finite[:, None], x, masked.mean(x, jnp.broadcast_to(finite[:, None], x.shape)))
+    neutral = lambda x: neutralised(x, finite)
     shares = {f"{NONFINITE_IN}{name}": jnp.mean(~each) for name, each in by_term.items()}
     shares[f"{NONFINITE_IN}total"] = jnp.mean(all_terms & ~finite)
     return neutral(reward), {name: neutral(term) for name, term in terms.items()}, finite, shares

@@ -25,7 +25,8 @@ def within_trust(
 
     θ = θ₀ + s (θ₁ − θ₀), from s = 1 on by s ← s √(δ / KL(π₀ ‖ π_s)) while KL(π₀ ‖ π_s) > 1.5 δ, four times at most: KL
     is quadratic in a small step, so that one shortening is enough for a step that is slightly too long, but not for a
-    much longer one, where KL grows more slowly.  An update that is short enough is measured once.  The KL is the k3
+    much longer one, where KL grows more slowly.  Where the KL is not finite, s is halved, and an update that still has
+    none is left out, s = 0.  An update that is short enough is measured once.  The KL is the k3
     estimate on the rollouts, with `learn.old` as log π₀.  The scaling of the trust-region step (TRPO, arXiv 1502.05477,
     appendix C), here of any optimizer's, with this fixed point for its line search.
 
@@ -48,14 +49,15 @@ def within_trust(
 
     def too_long(carry: tuple[Array, Array, Array]) -> Array:
         _, kl, measured = carry
-        return (kl > NEAR * delta) & (measured < MOST)
+        return ~(kl <= NEAR * delta) & (measured < MOST)
 
     def shortened(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         scale, kl, measured = carry
-        scale = scale * jnp.sqrt(delta / kl)
+        scale = scale * jnp.where(jnp.isfinite(kl), jnp.sqrt(delta / kl), 0.5)
         return scale, moved_by(scale), measured + 1
 
     whole = jnp.ones(())
     proposed = moved_by(whole)
-    scale, _, _ = jax.lax.while_loop(too_long, shortened, (whole, proposed, jnp.ones((), jnp.int32)))
+    scale, kl, _ = jax.lax.while_loop(too_long, shortened, (whole, proposed, jnp.ones((), jnp.int32)))
+    scale = jnp.where(jnp.isfinite(kl), scale, 0.0)
     return between(scale), {"update_kl": proposed, "update_scale": scale}

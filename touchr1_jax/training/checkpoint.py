@@ -243,10 +243,12 @@ class Checkpoints:
 
     def _set_aside(self, step: int) -> Path:
         names = itertools.chain([f"damaged-{step}"], (f"damaged-{step}-{i}" for i in itertools.count(2)))
+        multihost_utils.sync_global_devices(f"damaged {step}")  # all processes have read it
         aside = next(path for name in names if not (path := self._directory / name).exists())
+        multihost_utils.sync_global_devices(f"named {step}")  # all of them found the same name free
         if jax.process_index() == 0:
             (self._directory / str(step)).rename(aside)
-        multihost_utils.sync_global_devices(f"set aside {aside}")
+        multihost_utils.sync_global_devices(f"set aside {step}")
         self._manager.reload()
         return aside
 

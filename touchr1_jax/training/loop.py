@@ -71,7 +71,8 @@ class LoopTime:
     Attributes:
       steps: how many they were.
       total_s: what they took, saving included.
-      input_s: the part of it in which the device had nothing to do because the next batch was not there.
+      input_s: at most the part of it in which the device had nothing to do because the next batch was not there: of a
+        batch that came once the device had finished, the whole time of making it counts.
     """
 
     steps: int = 0

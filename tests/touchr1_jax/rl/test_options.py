@@ -16,7 +16,7 @@ from touchr1_jax.rl.gradient import Experience, log_probs
 from touchr1_jax.rl.grpo import make_grpo_step, start_state
 from touchr1_jax.rl.losses import over_tokens
 from touchr1_jax.rl.rollout import SampleConfig, drawn_log_probs, nucleus, sample_group
-from touchr1_jax.rl.update import bucketed_gradient, update_policy
+from touchr1_jax.rl.update import bucketed_gradient, over_minibatches, update_policy
 
 G, T, RATE = 3, 4, 1e-3
 CONFIG = GRPOConfig(prompts=P, group=G, length=T, micro_prompts=2, algorithm=Paper(beta=0.0, gamma=0.0))
@@ -122,6 +122,28 @@ def test_the_kl_in_the_reward_is_a_term_of_it(lagging):
     paid = jax.vmap(jax.vmap(lambda o, t: score(o, t)[0], (0, None)))(rollout.tokens, BATCH.target)
     np.testing.assert_allclose(metrics["reward"], metrics["reward_kl"] + np.mean(paid), rtol=1e-4)
     assert metrics["kl"] == metrics["kl_cost_peak"] == 0
+
+
+def test_a_group_that_is_left_out_has_the_mean_kl_of_the_others():
+    """Its reward is no number; a statistic over the batch sees the others alone."""
+    left_out = np.asarray(BATCH.target.asked[:, 0])
+    assert 0 < left_out.sum() < P
+
+    def broken(tokens, target):
+        reward, terms, parsed = score(tokens, target)
+        return jnp.where(target.asked[0], jnp.nan, reward), terms, parsed
+
+    step, state = of(broken, beta=0.1, kl_in_reward=True)
+    draw = SampleConfig(group=G, length=T, end_ids=FNS.end_ids, pad_id=FNS.pad_id)
+    sample_key, _ = jax.random.split(jax.random.fold_in(state.key, 0))
+    rollout = jax.jit(lambda: sample_group(FNS, START, BATCH, sample_key, draw))()
+    log_p, log_ref = (
+        jax.jit(lambda p: log_probs(FNS, CONFIG, p, BATCH, rollout))(p) for p in (START, FROZEN.reference)
+    )
+    kl = np.where(rollout.mask, log_p - log_ref, 0).sum(-1)
+    _, metrics = step(state, BATCH, FROZEN)
+    np.testing.assert_allclose(metrics["reward_kl"], -0.1 * kl[~left_out].mean(), rtol=1e-4)
+    assert abs(kl.mean() - kl[~left_out].mean()) > 1e-3
 
 
 CUT_OFF, EQUAL = 3, 6
@@ -272,12 +294,28 @@ def test_the_learner_scores_what_was_sampled_as_the_sampler_did():
     assert gap(CONFIG) > 0.1
 
 
+def test_metrics_of_minibatches_count_prompts_and_weigh_streams_by_them():
+    """Stream 0 was perturbed in three prompts of the first half, with grounding .2, and in one of the second, .6."""
+    parts = {
+        "grounding_stream_0": [0.2, 0.6],
+        "perturbed_stream_0": [3.0, 1.0],
+        "loss": [1.0, 2.0],
+        "kl_peak": [5.0, 4.0],
+    }
+    parts |= {"grounding_stream_1": [0.0, 0.0], "perturbed_stream_1": [0.0, 0.0]}
+    found = over_minibatches({name: jnp.array(x) for name, x in parts.items()})
+    hand = {"grounding_stream_0": 0.3, "perturbed_stream_0": 4, "grounding_stream_1": 0, "perturbed_stream_1": 0}
+    assert found == pytest.approx(hand | {"loss": 1.5, "kl_peak": 5})
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"minibatches": 0}, "minibatches is 0: must be at least 1"),
         ({"stale": -1}, "stale is -1: must be at least 0"),
         ({"reference_share": 0.0}, "reference_share is 0.0: must lie in 0 < share ≤ 1"),
+        ({"reference_share": 0.5}, "reference_share is 0.5: must be 1.0 where reference_every is None"),
+        ({"importance_sequence": True}, "importance_sequence is True: must be False where importance_cap is None"),
     ],
 )
 def test_bad_options_are_named(change, message):

@@ -67,6 +67,15 @@ def test_a_far_update_is_shortened_more_than_once(shorten):
     assert far["update_scale"] < 0.9 * np.sqrt(DELTA / far["update_kl"])
 
 
+def test_an_update_without_a_finite_kl_is_left_out(shorten):
+    """Parameters of 1e30 overflow in the first product, and those of a sixteenth of it do."""
+    params, size = shorten(1e30)
+    assert not np.isfinite(size["update_kl"])
+    assert size["update_scale"] == 0
+    for a, b in zip(*map(jax.tree.leaves, (params, BEFORE)), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
 @pytest.mark.parametrize(("kl", "stays"), [(1.3, True), (2.0, False)])
 def test_an_update_is_shortened_from_one_and_a_half_times_the_bound_on(shorten, kl, stays):
     size = 0.1 * np.sqrt(kl * DELTA / shorten(0.1)[1]["update_kl"])
