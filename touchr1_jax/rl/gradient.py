@@ -196,8 +196,8 @@ def prompt_terms(
     if anchored:
         of_answer = {"own": jax.tree.map(lambda x: x[-1], all_own), "token": batch.answer}
         log_prob = lambda r: token_log_probs(jax.nn.log_softmax(fns.logits(heads["own"], r["own"])), r["token"])
-        found = by_blocks(log_prob, of_answer, width=len(fns.banned), most=config.max_logits)
-        terms = terms._replace(answer_log_prob=found)
+        scores = by_blocks(log_prob, of_answer, width=len(fns.banned), most=config.max_logits)
+        terms = terms._replace(answer_log_prob=scores)
     if experience.levels is None:
         return terms
     return terms._replace(level_log_prob=level_log_probs(fns, config, heads["own"], own, experience.levels))
