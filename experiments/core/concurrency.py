@@ -3,12 +3,19 @@
 import concurrent.futures
 import math
 import os
+import resource
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import jax
 
 from experiments.core.context import Context
+from experiments.core.memory import free_bytes
+from touchr1_jax.distributed.processes import GIB
+
+ONE_SEED_BYTES, SEED_BYTES = 4 * GIB, round(1.4 * GIB)
+"""Memory of the first seed of a default study with its clips, and of each further one: arrays, and a compilation that
+may run at the same time as another.  Measured: 2.8 and 4.3 GiB with one seed and two."""
 
 Item = TypeVar("Item")
 T = TypeVar("T")
@@ -61,8 +68,14 @@ def concurrently(
 
 
 def idle_cores(context: Context) -> int:
-    """Cores that may compute an item each: all of a machine without an accelerator, one where devices are shared."""
+    """Cores that may compute an item each: all of a machine without an accelerator, one where devices are shared.
+
+    Not more than there is memory for.
+    """
     alone = context.processes.count == 1 and math.prod(context.devices.shape) == 1
     if not alone or jax.default_backend() != "cpu":
         return 1
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    room = free_bytes() if limit == resource.RLIM_INFINITY else min(free_bytes(), limit)
+    return min(cores, 1 + max(0, room - ONE_SEED_BYTES) // SEED_BYTES)

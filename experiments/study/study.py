@@ -18,7 +18,7 @@ from rich.console import Console
 
 from experiments.core import numerics, runs
 from experiments.core.artifacts import write_json
-from experiments.core.concurrency import concurrently
+from experiments.core.concurrency import concurrently, idle_cores
 from experiments.core.context import Context
 from experiments.core.errors import DataError
 from experiments.study.cache import NEVER, fingerprint, source_digest
@@ -123,7 +123,7 @@ def run_study(
     check_model(config.model, SENSORS)
     if config.encoder is not None:
         load_encoder(config.encoder)  # a file that is no encoder is reported before data are made
-    data, policy, tactile = _opened(config, context)
+    data, policy, tactile = _opened(config, context, min(idle_cores(context), config.seeds))
     if not context.launcher.here:
         order = tuple((name, seed) for name in (SFT, BLIND, CONTINUED, *arms) for seed in range(config.seeds))
         parts = [StudyPart(name=name, seed=seed, first=name in (SFT, BLIND)) for name, seed in order]
@@ -204,9 +204,9 @@ def train_part(
     SeedTraining(**shared, tactile=tactile, share=True, variants={}, seed=part.seed).train(part.name)
 
 
-def _opened(config: StudyConfig, context: Context) -> tuple[Dataset, TouchPolicy, Params | None]:
+def _opened(config: StudyConfig, context: Context, at_once: int = 1) -> tuple[Dataset, TouchPolicy, Params | None]:
     """Data, the untrained policy, and parameters of the tactile encoder that SFT starts from."""
-    data = open_study_data(config, context)
+    data = open_study_data(config, context, at_once)
     model, tactile = starting_model(config.model, config.encoder, data.clip.sensors)
     return data, with_lora(build_policy(model, data.clip.sensors), config.lora), tactile
 
@@ -250,9 +250,9 @@ def check_arms(
             raise ValueError(f"variant {name!r} has the name of a policy, whose answers it would replace; rename it")
 
 
-def open_study_data(config: StudyConfig, context: Context) -> Dataset:
-    """Records of the configured source, with clips of the model's size."""
-    return open_data(config, config.model.vision.image_px, context)
+def open_study_data(config: StudyConfig, context: Context, at_once: int = 1) -> Dataset:
+    """Records of the configured source, with clips of the model's size; `at_once` as in `open_data`."""
+    return open_data(config, config.model.vision.image_px, context, at_once)
 
 
 def train_study(

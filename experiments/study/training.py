@@ -4,6 +4,7 @@ import dataclasses
 from pathlib import Path
 from typing import Literal, TypeVar
 
+from experiments.core.concurrency import SEED_BYTES
 from experiments.core.context import Context
 from experiments.core.memory import require_memory
 from experiments.study.dataset import Dataset, open_dataset
@@ -138,8 +139,10 @@ def require_derived(field: str, value: int) -> None:
         raise ValueError(f"model.{field} is {value}: must be 0, the data and the language determine it; leave it out")
 
 
-def open_data(config: TrainingConfig, view_px: int, context: Context) -> Dataset:
+def open_data(config: TrainingConfig, view_px: int, context: Context, at_once: int = 1) -> Dataset:
     """Records of the configured source, with clips of the model's size and pictures of `view_px` rows and columns.
+
+    `at_once` is the number of seeds that are trained at the same time, for the estimate of the memory.
 
     Frames past the strain limit stay in: leaving them out would let the length of the force ramp give hardness away.
     """
@@ -150,7 +153,9 @@ def open_data(config: TrainingConfig, view_px: int, context: Context) -> Dataset
         rejected=(Flag.NOT_CONVERGED, Flag.SATURATED),
         show=config.show,
     )
-    context.print(require_memory({"clips at most": round(config.clip_memory_gib * GIB)}))
+    parts = {"clips at most": round(config.clip_memory_gib * GIB)}
+    more = {f"{at_once} seeds at a time": (at_once - 1) * SEED_BYTES} if at_once > 1 else {}
+    context.print(require_memory(parts | more))
     path = prepare_records(config, context)
     odd = odd_contacts(config, path, context)
     left_out = odd if config.drop_odd else ()

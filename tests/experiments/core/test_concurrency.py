@@ -1,6 +1,7 @@
 """Several seeds at a time: results, log and stops are those of one after the other."""
 
 import contextlib
+import resource
 import signal
 import threading
 import time
@@ -124,8 +125,14 @@ def test_a_signal_ends_all_after_their_step_and_the_run_resumes_with_the_same_bi
     assert train(tmp_path / "stopped", 2)[1] == log
 
 
-def test_processes_and_meshes_train_one_seed_after_the_other(tmp_path):
+def test_processes_meshes_and_little_memory_train_one_seed_after_the_other(tmp_path):
     with contextlib.closing(open_run(tmp_path)) as context:
         assert idle_cores(context) >= 1
+        soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+        try:
+            resource.setrlimit(resource.RLIMIT_AS, (5 * 2**30, hard))  # memory for one seed
+            assert idle_cores(context) == 1
+        finally:
+            resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
         context.devices.shape = (2, 1, 1)
         assert idle_cores(context) == 1
