@@ -62,7 +62,10 @@ class Mirror:
             fix = "must be of a kind that fsspec knows, its package installed; pip install 'touchr1-jax[cloud]'"
             raise StoreError(f"{self.url} cannot be opened ({error}): {fix}") from error
         self._cache = pathlib.Path(os.environ.get(CACHE, "~/.cache/touchr1")).expanduser()
-        self._most = _cache_bytes(os.environ.get(CACHE_GB, "50"))
+        stated = os.environ.get(CACHE_GB, "50")
+        if re.fullmatch(r"(\d+\.?\d*|\.\d+)(e-?\d)?", stated) is None:
+            raise StoreError(f"{CACHE_GB} is {stated!r}: must be a number of gigabytes ≥ 0; correct it, or unset it")
+        self._most = int(float(stated) * 1e9)
 
     def __str__(self) -> str:
         return self.url
@@ -71,11 +74,7 @@ class Mirror:
         return Mirror, (self.url,)
 
     def fetch(self, name: str, size: int | None = None) -> pathlib.Path:
-        """A copy of a file in the cache; it may be removed for others once it is not read for a while.
-
-        Args:
-          name: in the folder.
-          size: that it must have, in bytes.
+        """A copy of a file of `size` bytes in the cache; others may take its place once it is not read for a while.
 
         Raises:
           StoreError: it is not there or has another size, or the store fails again and again.
@@ -159,11 +158,7 @@ class Mirror:
             (folder / name).symlink_to(self.fetch(name).absolute())
 
     def publish(self, folder: pathlib.Path, names: Iterable[str]) -> int:
-        """Upload files of a folder in this order, each verified; those of which the store has the MD5 are left.
-
-        Returns:
-          Bytes that were uploaded.
-        """
+        """Upload and verify files of a folder in this order, without those whose MD5 the store has; the bytes sent."""
         sent, there = 0, self.files()
         for name in names:
             size, target = (folder / name).stat().st_size, f"{self._path}/{name}"
@@ -215,16 +210,6 @@ def place(path: str | os.PathLike[str]) -> Place:
 def local(root: Place, name: str, size: int | None = None) -> pathlib.Path:
     """A file of a folder on this machine; see `Mirror.fetch`."""
     return root / name if isinstance(root, pathlib.Path) else root.fetch(name, size)
-
-
-def _cache_bytes(stated: str) -> int:
-    try:
-        size = float(stated)
-    except ValueError:
-        size = -1.0
-    if not 0 <= size <= 1e9:
-        raise StoreError(f"{CACHE_GB} is {stated!r}: must be a number of gigabytes ≥ 0; correct it, or unset it")
-    return int(size * 1e9)
 
 
 def _md5(path: pathlib.Path) -> str:

@@ -6,6 +6,7 @@ has the others run; a driver that was killed is started again with the same comm
 """
 
 import concurrent.futures
+import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -113,17 +114,14 @@ def finish(units: Sequence[WorkUnit], launcher: Launcher, say: Callable[[str], o
 
 
 def _run(units: Sequence[WorkUnit], launcher: Launcher, say: Callable[[str], object]) -> Iterator[WorkUnit]:
-    before = signal.getsignal(signal.SIGTERM)
-    try:
-        died, submit, close = _ENGINES[launcher.engine](launcher)  # Ray takes the signal
-    except BaseException:
-        signal.signal(signal.SIGTERM, before)
-        raise
-    signal.signal(signal.SIGTERM, signal.default_int_handler if before is signal.SIG_DFL else before)
     size = -(-len(units) // launcher.workers) if launcher.engine == "slurm" else 1  # a job compiles once for its share
     groups = [tuple(units[i : i + size]) for i in range(0, len(units), size)]
-    failed = dict[str, str]()
-    try:
+    failed, before = dict[str, str](), signal.getsignal(signal.SIGTERM)
+    with contextlib.ExitStack() as ended:
+        ended.callback(signal.signal, signal.SIGTERM, before)
+        died, submit, close = _ENGINES[launcher.engine](launcher)  # Ray takes the signal
+        ended.callback(close)
+        signal.signal(signal.SIGTERM, signal.default_int_handler if before is signal.SIG_DFL else before)
         pending = {future: (group, 0) for future, group in zip(submit(groups), groups, strict=True)}
         while pending:
             for future in [future for future in pending if future.done()]:
@@ -138,9 +136,6 @@ def _run(units: Sequence[WorkUnit], launcher: Launcher, say: Callable[[str], obj
                 else:
                     failed |= wrong
             time.sleep(POLL_S)
-    finally:
-        close()
-        signal.signal(signal.SIGTERM, before)
     if failed:
         name, why = next(iter(failed.items()))
         counts = f"{len(failed)} of {len(units)} units failed, the first {name}: {why}"
@@ -281,11 +276,7 @@ def versions() -> Mapping[str, str]:
 
 
 def check_versions(expected: Mapping[str, str]) -> None:
-    """Compare this worker with the driver.
-
-    Raises:
-      LauncherError: a version differs.
-    """
+    """Compare this worker with the driver; `LauncherError` names a version that differs."""
     for name, version in versions().items():
         if version != expected.get(name):
             differs = f"worker {socket.gethostname()} has {name} {version}, the driver {expected.get(name)}"
