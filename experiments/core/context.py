@@ -172,10 +172,14 @@ class Context:
         if self._log is not None:
             self._log.sort()
 
-    def compiling(self, program: str) -> threading.Lock:
-        """The lock of a program's first step: a thread that needs it too waits, and finds it compiled."""
+    @contextlib.contextmanager
+    def compiling(self, program: str) -> Iterator[Callable[[], None]]:
+        """Let other threads that run a program wait until this one has compiled it and calls the given function."""
         with self._lock:
-            return self._compiling.setdefault(program, threading.Lock())
+            lock = self._compiling.setdefault(program, threading.Lock())
+        with contextlib.ExitStack() as first:
+            first.enter_context(lock)
+            yield first.close
 
     @contextlib.contextmanager
     def progress(

@@ -46,10 +46,9 @@ def stage_hooks(
         Checkpoints(folder, better="higher" if scored else None, print_=context.print) as checkpoints,
         context.timed(stage),
         context.stopping.patient(context.processes.any) as stopping,
-        contextlib.ExitStack() as compiling,
+        context.compiling(stage.rpartition("/")[0]) as compiled,  # all seeds run one program
         contextlib.ExitStack() as bar,
     ):
-        compiling.enter_context(context.compiling(stage.rpartition("/")[0]))  # all seeds run one program
 
         def resumed(start: int) -> None:
             context.require_logged(stage, start)
@@ -59,7 +58,7 @@ def stage_hooks(
             advance = bar.enter_context(context.progress(stage, steps, min(start, steps), note=COMPILING))
 
             def log(t: int, metrics: dict[str, float]) -> None:
-                compiling.close()
+                compiled()
                 left_out.append(metrics.get(SKIPPED, 0.0))
                 write(t, metrics)
                 advance()

@@ -162,11 +162,6 @@ class Algorithm:
         at_least(self, 0, "stale", "score_centering")
         if not 0 < self.reference_share <= 1:
             raise ValueError(f"reference_share is {self.reference_share}: must lie in 0 < share ≤ 1; 1 is no average")
-        changes = {"importance_sequence": (False, "importance_cap"), "reference_share": (1.0, "reference_every")}
-        for field, (unset, other) in changes.items():
-            if getattr(self, field) != unset and getattr(self, other) is None:
-                needs = f"must be {unset} where {other} is None, for it changes what that does; set both"
-                raise ValueError(f"{field} is {getattr(self, field)}: {needs}")
         sizes = ("clip_low", "clip_high", "epsilon", "beta", "entropy_weight", "gamma", "anchor", "tactile_weight")
         for field in sizes:
             if not (isinstance(getattr(self, field), jax.Array) or getattr(self, field) >= 0):
