@@ -20,13 +20,19 @@ MakeLog = Callable[[Context, str, int], Log]
 """From the run, a stage and its first step to what receives (step, metrics)."""
 
 
+def unchanged(context: Context, stage: str, start: int) -> Log:
+    """A log that writes the metrics as they are."""
+    del start
+    return lambda t, metrics: context.log(stage, t, **metrics)
+
+
 @contextlib.contextmanager
 def stage_hooks(
     context: Context,
     stage: str,
     steps: int,
     *,
-    make_log: MakeLog | None = None,
+    make_log: MakeLog = unchanged,
     scored: bool = False,
     describe: Callable[[Any], TrainingSample] | None = None,
 ) -> Iterator[Hooks]:
@@ -53,14 +59,13 @@ def stage_hooks(
         def resumed(start: int) -> None:
             context.require_logged(stage, start)
             context.rewind(stage, start)
-            plain: Log = lambda t, metrics: context.log(stage, t, **metrics)
-            write = plain if make_log is None else make_log(context, stage, start)
+            log_step = make_log(context, stage, start)
             advance = bar.enter_context(context.progress(stage, steps, min(start, steps), note=COMPILING))
 
             def log(t: int, metrics: dict[str, float]) -> None:
                 compiled()
                 left_out.append(metrics.get(SKIPPED, 0.0))
-                write(t, metrics)
+                log_step(t, metrics)
                 advance()
 
             logs.append(log)
@@ -109,7 +114,7 @@ def run_loop(
     context: Context,
     stage: str,
     *,
-    make_log: MakeLog | None = None,
+    make_log: MakeLog = unchanged,
     held_out: Callable[[Any], float] | None = None,
 ) -> Any:
     """Call `fit` with `stage_hooks`: a stopped stage resumes from its newest checkpoint with bit-identical results."""
