@@ -280,9 +280,10 @@ class SeedTraining(StudySeed):
             first = self.seed % len(others)  # seeds that are trained at the same time compile different programs
             for name in others[first:] + others[:first]:
                 self._evaluate_all(name, self._continue(name, params, contacts, validation), test, contacts.noise)
-            blind = self._train_blind()
-            unfelt = self.encode(blind, "test", blind=True)
-            self._evaluate(BLIND, lambda: self.ask(blind, unfelt, samples=self.config.samples))
+            if not self._path(BLIND).exists():
+                blind = self._train_blind()
+                unfelt = self.encode(blind, "test", blind=True)
+                self._evaluate(BLIND, lambda: self.ask(blind, unfelt, samples=self.config.samples))
         return {name: load_answers(self._path(name)) for name in names}
 
     def train(self, name: str) -> None:

@@ -108,9 +108,8 @@ def test_the_reference_moves_by_its_share(lagging):
         close(after.reference, mixed, rtol=1e-6)
 
 
-def test_the_kl_in_the_reward_is_a_term_of_it(lagging):
-    """−β Σ_t log(π/π_ref) of the rollouts, from log-probabilities of their own; the loss has no KL then."""
-    state, metrics = lagging[0][0], lagging[1][0]
+def first_kl(state):
+    """Rollouts of the first step from a state, and Σ_t log(π/π_ref) of each."""
     draw = SampleConfig(group=G, length=T, end_ids=FNS.end_ids, pad_id=FNS.pad_id)
     sample_key, _ = jax.random.split(jax.random.fold_in(state.key, 0))
     rollout = jax.jit(lambda: sample_group(FNS, START, BATCH, sample_key, draw))()
@@ -118,6 +117,13 @@ def test_the_kl_in_the_reward_is_a_term_of_it(lagging):
         jax.jit(lambda p: log_probs(FNS, CONFIG, p, BATCH, rollout))(p) for p in (START, FROZEN.reference)
     )
     kl = np.where(rollout.mask, log_p - log_ref, 0).sum(-1)
+    return rollout, kl
+
+
+def test_the_kl_in_the_reward_is_a_term_of_it(lagging):
+    """−β Σ_t log(π/π_ref) of the rollouts, from log-probabilities of their own; the loss has no KL then."""
+    state, metrics = lagging[0][0], lagging[1][0]
+    rollout, kl = first_kl(state)
     np.testing.assert_allclose(metrics["reward_kl"], -0.1 * kl.mean(), rtol=1e-4)
     paid = jax.vmap(jax.vmap(lambda o, t: score(o, t)[0], (0, None)))(rollout.tokens, BATCH.target)
     np.testing.assert_allclose(metrics["reward"], metrics["reward_kl"] + np.mean(paid), rtol=1e-4)
@@ -134,13 +140,7 @@ def test_a_group_that_is_left_out_has_the_mean_kl_of_the_others():
         return jnp.where(target.asked[0], jnp.nan, reward), terms, parsed
 
     step, state = of(broken, beta=0.1, kl_in_reward=True)
-    draw = SampleConfig(group=G, length=T, end_ids=FNS.end_ids, pad_id=FNS.pad_id)
-    sample_key, _ = jax.random.split(jax.random.fold_in(state.key, 0))
-    rollout = jax.jit(lambda: sample_group(FNS, START, BATCH, sample_key, draw))()
-    log_p, log_ref = (
-        jax.jit(lambda p: log_probs(FNS, CONFIG, p, BATCH, rollout))(p) for p in (START, FROZEN.reference)
-    )
-    kl = np.where(rollout.mask, log_p - log_ref, 0).sum(-1)
+    _, kl = first_kl(state)
     _, metrics = step(state, BATCH, FROZEN)
     np.testing.assert_allclose(metrics["reward_kl"], -0.1 * kl[~left_out].mean(), rtol=1e-4)
     assert abs(kl.mean() - kl[~left_out].mean()) > 1e-3
