@@ -148,17 +148,17 @@ class Algorithm:
     """Largest KL between the policies before and after an update, nat a token; longer updates are shortened."""
 
     def __post_init__(self) -> None:
-        for field in ("best_of", "candidates", "controls", "updates", "minibatches", "reference_every"):
-            count = getattr(self, field)
-            if count is not None and count < 1:
-                raise ValueError(f"{field} is {count}: must be at least 1; raise it")
+        counted = "best_of", "candidates", "controls", "updates", "minibatches", "reference_every"
+        at_least(self, 1, *(name for name in counted if getattr(self, name) is not None))
         sampled = {"best_of": 1, "segment_credit": False, "kl_in_reward": False, "tactile_use": TactileUse.OFF}
         for field, value in (sampled if self.enumerated is not None else {}).items():
             if getattr(self, field) != value:
                 needs = f"must be {value} where enumerated is set, because it needs a sampled conclusion; change either"
                 raise ValueError(f"{field} is {getattr(self, field)}: {needs}")
-        if not self.learn_conclusion and self.enumerated is None:
-            raise ValueError("learn_conclusion is False, but enumerated is None: must be set; choose a norm for it")
+        idle = ("learn_conclusion", "enumerated"), ("importance_sequence", "importance_cap")
+        for field, needed in (*idle, ("reference_share", "reference_every")):
+            if getattr(self, field) != getattr(type(self), field) and getattr(self, needed) is None:
+                raise ValueError(f"{field} is {getattr(self, field)}, but {needed} is None: set it, or leave {field} out")
         at_least(self, 0, "stale", "score_centering")
         if not 0 < self.reference_share <= 1:
             raise ValueError(f"reference_share is {self.reference_share}: must lie in 0 < share ≤ 1; 1 is no average")

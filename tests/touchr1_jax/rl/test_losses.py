@@ -367,7 +367,7 @@ def test_centered_scores_have_no_mean_under_the_sampler(cap, k):
     ("change", "message"),
     [
         ({"surrogate": Surrogate.CISPO}, "surrogate is Surrogate.CISPO: must be Surrogate.TOKEN"),
-        ({"importance_sequence": True}, "importance_sequence is True: must be False"),
+        ({"importance_sequence": True, "importance_cap": 2.0}, "importance_sequence is True: must be False"),
         ({"minibatches": 2}, "minibatches is 2: must be 1 where score_centering is set; change either"),
         ({"stale": 1}, "stale is 1: must be 0 for score_centering without importance_cap; set a cap"),
     ],

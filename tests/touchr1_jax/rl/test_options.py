@@ -313,7 +313,9 @@ def test_metrics_of_minibatches_count_prompts_and_weigh_streams_by_them():
     [
         ({"minibatches": 0}, "minibatches is 0: must be at least 1"),
         ({"stale": -1}, "stale is -1: must be at least 0"),
-        ({"reference_share": 0.0}, "reference_share is 0.0: must lie in 0 < share ≤ 1"),
+        ({"reference_share": 0.0, "reference_every": 2}, "reference_share is 0.0: must lie in 0 < share ≤ 1"),
+        ({"reference_share": 0.5}, "reference_share is 0.5, but reference_every is None: set it"),
+        ({"importance_sequence": True}, "importance_sequence is True, but importance_cap is None: set it"),
     ],
 )
 def test_bad_options_are_named(change, message):
