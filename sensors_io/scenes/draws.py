@@ -16,7 +16,8 @@ from sensors_io.scenes.config import SceneConfig, stream
 from sensors_io.scenes.press import Path, Press
 from sensors_io.scenes.readout import Unit
 from sensors_io.scenes.sensors import BODY, MODELS, SensorModel
-from sensors_io.scenes.units import UNITS, as_f32, on_one_day, place, unit_of
+from sensors_io.scenes.surface import as_f32
+from sensors_io.scenes.units import UNITS, on_one_day, place, unit_of
 from sensors_io.schema import Phase
 
 SITE_MM = 8.0

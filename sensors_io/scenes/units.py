@@ -3,14 +3,13 @@
 import dataclasses
 import functools
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sensors_io.scenes import optics, surface
 from sensors_io.scenes.config import stream
 from sensors_io.scenes.readout import Unit
 from sensors_io.scenes.sensors import MODELS
+from sensors_io.scenes.surface import as_f32
 
 UNITS = 3
 """Physical units of every sensor type."""
@@ -66,8 +65,3 @@ def place(turn: float, rng: np.random.Generator) -> surface.SensorPose:
         turn_rad=as_f32(turn + rng.normal(0, np.deg2rad(PLACE_TURN_DEG))),
         tilt=as_f32(rng.normal(0, np.deg2rad(PLACE_TILT_DEG), 2)),
     )
-
-
-def as_f32(value: float | np.ndarray) -> jax.Array:
-    """A number or an array of the host for a compiled program."""
-    return jnp.asarray(value, jnp.float32)
