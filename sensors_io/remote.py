@@ -142,15 +142,16 @@ class Mirror:
             held -= bytes_
 
     def files(self) -> dict[str, str]:
-        """File → MD5 where the store tells one; nothing where the folder does not exist yet."""
+        """File → MD5 where the store tells one, of its folders too; nothing where the folder does not exist yet."""
 
-        def listed() -> list[dict[str, Any]]:
+        def listed() -> dict[str, dict[str, Any]]:
             with contextlib.suppress(FileNotFoundError):
-                return list(self._store.ls(self._path, detail=True))
-            return []
+                return dict(self._store.find(self._path, detail=True))
+            return {}
 
         found = self._retried(listed, "")
-        return {one["name"].rpartition("/")[2]: str(one.get("ETag", "")).strip('"') for one in found}
+        name = lambda path: path.partition(f"{self._path}/")[2]
+        return {name(path): str(about.get("ETag", "")).strip('"') for path, about in found.items()}
 
     def copy(self, folder: pathlib.Path) -> None:
         """Show all files of the URL in a folder on this machine, under their own names."""

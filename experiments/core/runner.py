@@ -30,12 +30,13 @@ from experiments.core.commands import PROG, find, print_error, print_lines, run_
 from experiments.core.context import Context, read_metrics
 from experiments.core.loops import left_out_tables
 from experiments.core.memory import require_memory
+from experiments.core.remote_runs import run_at
 from experiments.core.report import write_report
 from experiments.core.results import Results
 from experiments.core.stopping import Stopped, Stopping
 from experiments.core.text import MEANINGLESS, SMOKE, aligned
 from sensors_io.errors import UserError
-from sensors_io.remote import at_url
+from sensors_io.remote import StoreError, at_url
 from sensors_io.scenes.backend import require_backend
 from sensors_io.units import HERE, Launcher, LauncherError
 from touchr1_jax.distributed.companions import DifferentProcessesError, watched
@@ -183,17 +184,22 @@ def run_experiment(experiment: Experiment[Any], arguments: Sequence[str], about:
     if why := _refusal(experiment, command):
         print_error(why)
         return 2
+    typed = shlex.join([*PROG.split(), experiment.name, *arguments])
+    execute = lambda folder: _execute(experiment, dataclasses.replace(command, runs_dir=folder), about, typed)
     with compiled_quickly() if command.scale in experiment.quick else contextlib.nullcontext():
-        return _execute(experiment, command, about, shlex.join([*PROG.split(), experiment.name, *arguments]))
+        if not at_url(command.runs_dir):
+            return execute(command.runs_dir)
+        try:
+            return run_at(str(command.runs_dir), experiment.name, execute)
+        except StoreError as error:
+            print_error(f"StoreError: {error}")
+            return 1
 
 
 def _refusal(experiment: Experiment[Any], command: Any) -> str:
     """The reason why a command cannot run, and the fix; empty if it can."""
-    if at_url(command.runs_dir):
-        return (
-            f"runs-dir is {command.runs_dir}: must be a folder, for a run locks, appends to and replaces its files, "
-            "which no store can; name one, and afterwards `export` a policy to the URL"
-        )
+    if at_url(command.runs_dir) and command.launch.distributed:
+        return f"runs-dir is {command.runs_dir}: must be a folder that all processes share with --distributed; name one"
     if not experiment.spreads and (command.launch != Launch() or command.launcher != HERE):
         return f"{experiment.name} runs in one process on one device; leave --distributed, --mesh, --launcher out"
     if command.launch.distributed and command.launcher != HERE:
@@ -224,7 +230,11 @@ def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> 
             ("fresh", Annotated[bool, tyro.conf.arg(help="Start a new run though an unfinished one exists.")], False),
             ("tensorboard", Annotated[bool, tyro.conf.arg(help=events)], False),
             ("wandb", Annotated[bool, tyro.conf.arg(help="Also send every figure to Weights & Biases.")], False),
-            ("runs_dir", Annotated[Path, tyro.conf.arg(help="Folder of all runs.")], Path("runs")),
+            (
+                "runs_dir",
+                Annotated[Path, tyro.conf.arg(help="Folder of all runs, or a URL such as s3://bucket/runs.")],
+                Path("runs"),
+            ),
             ("cache_dir", Annotated[Path, tyro.conf.arg(help="Folder of data and compiled programs.")], Path("data")),
             ("launch", Annotated[Launch, tyro.conf.arg(name="")], Launch()),
             ("launcher", Annotated[Launcher, tyro.conf.arg(name="")], HERE),

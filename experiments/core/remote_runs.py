@@ -1,0 +1,126 @@
+"""Runs at a URL: computed in a folder of this machine, copied to the URL as they go on, continued from there anywhere.
+
+A store can neither lock nor append to a file, so one machine at a time may compute a run.
+"""
+
+import contextlib
+import logging
+import shutil
+import tempfile
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from experiments.core.commands import print_error, print_lines
+from sensors_io.remote import Mirror, StoreError
+
+EVERY_S = 60.0
+"""Between two copies: what a machine computed in the last minute before it is lost is computed again."""
+
+RESULTS = "results.json"
+_HALF = ".orbax-checkpoint-tmp"  # in the name of a checkpoint that is being written
+_LOG = logging.getLogger(__name__)
+
+
+def run_at(url: str, name: str, execute: Callable[[Path], int]) -> int:
+    """Compute a run of an experiment in a folder that is copied to `url`/`name`; the exit code.
+
+    Args:
+      url: of all runs.
+      name: of the experiment.
+      execute: runs or continues in a folder of runs; returns the exit code.
+
+    Raises:
+      StoreError: before anything is computed, if the store cannot be read.
+    """
+    remote, runs_dir = Mirror(f"{url}/{name}"), Path(tempfile.mkdtemp(prefix="touchr1-runs-"))
+    copier, ended = _Copier(remote, runs_dir / name), threading.Event()
+    copier.fetch()
+    copying = threading.Thread(target=copier.copy_until, args=(ended,), daemon=True)
+    copying.start()
+    try:
+        code = execute(runs_dir)
+    finally:
+        ended.set()
+        copying.join()
+    try:
+        copier.copy()
+    except StoreError as error:
+        print_error(f"StoreError: {error}\nThe run is in {runs_dir / name}: copy it to {remote} yourself, or lose it")
+        return code or 1
+    shutil.rmtree(runs_dir)
+    print_lines(f"the run is at {remote}")
+    return code
+
+
+class _Copier:
+    """Copies the runs of an experiment between a folder and a URL, of which the URL's are the true ones."""
+
+    def __init__(self, remote: Mirror, folder: Path) -> None:
+        self._remote, self._folder = remote, folder
+        self._sent = dict[str, tuple[int, int]]()
+
+    def fetch(self) -> None:
+        """Take the unfinished runs of the URL."""
+        files = self._remote.files()
+        finished = {name.partition("/")[0] for name in files if name.partition("/")[2] == RESULTS}
+        for name in files:
+            if name.partition("/")[0] not in finished:
+                (path := self._folder / name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(self._remote.fetch(name), path)
+        self._sent = {name: _state(path) for name, path in self._files().items()}
+
+    def copy_until(self, ended: threading.Event) -> None:
+        """Copy every `EVERY_S` seconds; a store that fails is tried again the next time."""
+        while not ended.wait(EVERY_S):
+            try:
+                self.copy()
+            except StoreError as error:
+                _LOG.warning("%s: the run goes on, and is copied in %g s", error, EVERY_S)
+
+    def copy(self) -> None:
+        """Copy what changed.
+
+        A run must go on from any part of a copy.  So finished stages and checkpoints are listed before the log is read
+        and sent after it, which then has their lines; the results, which mark a run as finished, are sent last.
+        """
+        files = self._files()
+        states = {name: _state(path) for name, path in files.items()}
+        changed = sorted((name for name in files if self._sent.get(name) != states[name]), key=lambda n: not _whole(n))
+        with tempfile.TemporaryDirectory(dir=self._folder.parent) as snapshot:
+            kept = [name for name in changed if _keep(files[name], Path(snapshot, name))]
+            rank = lambda name: 2 if name.split("/")[1] == RESULTS else _whole(name)
+            self._remote.publish(Path(snapshot), sorted(kept, key=rank))
+        self._sent |= {name: states[name] for name in kept}
+
+    def _files(self) -> dict[str, Path]:
+        """The files of all runs, without locks, the link to the latest run and what is half-written."""
+        found = dict[str, Path]()
+        for run in (path for path in self._folder.glob("*") if not path.is_symlink()):
+            for path in run.rglob("*"):
+                name = path.relative_to(self._folder).as_posix()
+                if path.is_file() and not any(part[0] == "." or _HALF in part for part in name.split("/")):
+                    found[name] = path
+        return found
+
+
+def _whole(name: str) -> bool:
+    """True of a file that is written in one step and never changes."""
+    return name.split("/")[1] in ("stages", "checkpoints")
+
+
+def _state(path: Path) -> tuple[int, int]:
+    """What changes with the content of a file: size and time."""
+    with contextlib.suppress(FileNotFoundError):
+        found = path.stat()
+        return found.st_size, found.st_mtime_ns
+    return -1, -1
+
+
+def _keep(path: Path, target: Path) -> bool:
+    """Keep a file as it is now, for the upload; false if it was removed, as an old checkpoint is."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with contextlib.suppress(FileNotFoundError):
+        shutil.copyfile(path, target)
+        return True
+    return False
