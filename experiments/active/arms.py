@@ -76,13 +76,13 @@ class LearnerConfig:
         steps=900,
         batch_size=128,
         questions=1,
-        micro_contacts=128,
+        micro_contacts=32,
         optimizer=OptimizerConfig(learning_rate=1e-5, lr_scale=100.0, weight_decay=0.05),
     )
     grpo: GRPOConfig = GRPOConfig(
         prompts=40,
         group=16,
-        micro_prompts=40,
+        micro_prompts=10,
         lr_scale=1000.0,
         algorithm=TOUCHES,
     )

@@ -16,15 +16,18 @@ from experiments.core import runs
 from experiments.core.artifacts import read_json
 from tests.experiments.core.noted_sweep import attempts
 
-SWEEP = ("dataset_card", "--scale", "smoke", "--vary", "seed=0,1,2,3,4,5,6,7")
+SWEEPS = {
+    "audits a data set": ("dataset_card", "seed=0,1,2,3,4,5,6,7", 5.0),
+    "trains an encoder": ("pretrain_encoder", "pretrain.optimizer.lr-scale=20,30,50,70,100,150,200,300", 15.0),
+}
+"""Experiment, what varies, and the longest life of a unit that is killed, s; one that is left alone takes longer."""
 RAY = ("--launcher", "ray", "--launcher.workers", "2")
 WORKERS, DRIVERS, SEED = 20, 3, 33
-LONGEST_LIFE_S = 5.0
-"""Of a unit that is about to be killed; one that is left alone takes longer."""
 
 
-def begin(folder: Path, *options: str) -> subprocess.Popen:
-    words = [*SWEEP, "--into", str(folder), "--cache-dir", str(folder.parent / "cache"), *options]
+def begin(name: str, varied: str, folder: Path, *options: str) -> subprocess.Popen:
+    cache = folder.parent / f"cache of {folder.name}"
+    words = [name, "--scale", "smoke", "--vary", varied, "--into", str(folder), "--cache-dir", str(cache), *options]
     command = [sys.executable, "-m", "tests.experiments.core.noted_sweep", *words]
     with (folder.parent / "printed.txt").open("a") as log:
         return subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
@@ -41,14 +44,14 @@ def alive(pid: int) -> bool:
     return False
 
 
-def kill_all(folder: Path) -> collections.Counter[str]:
+def kill_all(name: str, varied: str, longest_life_s: float, folder: Path) -> collections.Counter[str]:
     """Kill workers and drivers in a drawn order at drawn moments, then let the sweep end; unit → its kills."""
     rng, killed = random.Random(SEED), collections.Counter[str]()
     order = ["worker"] * WORKERS + ["driver"] * DRIVERS
     rng.shuffle(order)
-    driver = begin(folder, *RAY)
+    driver = begin(name, varied, folder, *RAY)
     for victim in order:
-        life_s, seen = rng.uniform(0, LONGEST_LIFE_S), collections.Counter[int]()
+        life_s, seen = rng.uniform(0, longest_life_s), collections.Counter[int]()
         while not (old := [x for x in running(folder) if seen[x[1]] * 0.1 >= life_s]):
             assert driver.poll() is None, f"the sweep ended before a {victim} was killed"
             seen.update(pid for _, pid in running(folder))
@@ -63,25 +66,28 @@ def kill_all(folder: Path) -> collections.Counter[str]:
             driver.wait()
             while running(folder):
                 time.sleep(0.1)
-            driver = begin(folder, *RAY)
+            driver = begin(name, varied, folder, *RAY)
     assert driver.wait() == 0
     return killed
 
 
-def results(folder: Path) -> dict[str, dict]:
+def results(home: Path) -> dict[str, dict]:
     """Content of `results.json` of each run by its configuration, without its time."""
-    found = [read_json(run / "results.json") for run in runs.started(folder / SWEEP[0])]
+    found = [read_json(run / "results.json") for run in runs.started(home)]
     return {str(one["config"]): {name: value for name, value in one.items() if name != "timing"} for one in found}
 
 
 @pytest.mark.slow
-def test_twenty_three_kills_change_nothing(tmp_path):
+@pytest.mark.parametrize("kind", SWEEPS)
+def test_twenty_three_kills_change_nothing(kind, tmp_path):
     pytest.importorskip("ray")
-    assert begin(tmp_path / "alone").wait() == 0
-    killed = kill_all(tmp_path / "killed")
+    name, varied, longest_life_s = SWEEPS[kind]
+    assert begin(name, varied, tmp_path / "alone").wait() == 0
+    killed = kill_all(name, varied, longest_life_s, tmp_path / "killed")
     tried = collections.Counter(unit for unit, _, _ in attempts(tmp_path / "killed"))
     sys.stdout.write(f"attempts {dict(tried)}, kills {dict(killed)}\n")
     assert len(tried) == 8
     assert all(tried[unit] <= killed[unit] + 1 for unit in tried)
-    assert results(tmp_path / "killed") == results(tmp_path / "alone")
-    assert len(results(tmp_path / "alone")) == 8
+    alone = results(tmp_path / "alone" / name)
+    assert results(tmp_path / "killed" / name) == alone
+    assert len(alone) == 8
