@@ -39,7 +39,7 @@ EVERY_TOUCH = "every_touch"  # the control that makes every contact; of the firs
 
 
 TOUCHES = Paper(beta=0.02, kl="exact", gamma=0.0, constrained=True, enumerated=Norm.STD, learn_conclusion=False)
-"""Learns touches alone, from the probability of the right answer."""
+"""Learns touches alone, from the probability of the right answer; the answers stay those of the warm start."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -64,7 +64,7 @@ class LearnerConfig:
       decoder: sizes; the vocabulary comes from the language.
       warm: warm start on touches drawn at random.
       grpo: a step of reinforcement; its length follows from the budget.  By default it learns touches alone, from the
-        probability of the right answer; the KL to the warm start keeps the answers, and touches apart.
+        probability of the right answer; a KL to the warm start keeps the answers, a light one touches apart.
       steps: of reinforcement.
       dropout: probability that a sensor or a motion drops out of a prompt.
       kept: choices of each question among which look-ups search for several contacts.
@@ -83,10 +83,10 @@ class LearnerConfig:
         prompts=40,
         group=16,
         micro_prompts=10,
-        lr_scale=1000.0,
+        lr_scale=2000.0,
         algorithm=TOUCHES,
     )
-    steps: int = 200
+    steps: int = 120
     dropout: float = 0.1
     kept: int = 12
     thresholds: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8, 0.9)

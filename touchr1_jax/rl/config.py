@@ -93,7 +93,7 @@ class Algorithm:
     enumerated: Norm | None = None
     """Enumerate the level that concludes an answer, rewards over this norm; `None` samples it (see `enumerated`)."""
     learn_conclusion: bool = True
-    """Learn the level that concludes, too; False needs `enumerated` and learns only the tokens before it."""
+    """Learn the level that concludes; False needs `enumerated`, and the level follows the reference (KL, weight 1)."""
     segment_credit: bool = False
     """Credit a token only with rewards that are not settled before its segment (`advantages.segment_advantages`)."""
     stable_rewards: bool = False
@@ -158,7 +158,7 @@ class Algorithm:
         idle = ("learn_conclusion", "enumerated"), ("importance_sequence", "importance_cap")
         for field, needed in (*idle, ("reference_share", "reference_every")):
             if getattr(self, field) != getattr(type(self), field) and getattr(self, needed) is None:
-                raise ValueError(f"{field} is {getattr(self, field)}, but {needed} is None: set it, or leave {field} out")
+                raise ValueError(f"{field} is {getattr(self, field)}, but {needed} is None: set it or drop {field}")
         at_least(self, 0, "stale", "score_centering")
         if not 0 < self.reference_share <= 1:
             raise ValueError(f"reference_share is {self.reference_share}: must lie in 0 < share ≤ 1; 1 is no average")

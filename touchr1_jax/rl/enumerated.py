@@ -137,11 +137,11 @@ def _norm(
 
 
 def conclude_exactly(
-    objective: Float[Array, "*p G T"], exact: Float[Array, "*p G"], at: Int[Array, "*p G"]
+    objective: Float[Array, "*p G T"], concluded: Float[Array, "*p G t"], at: Int[Array, "*p G"]
 ) -> Float[Array, "*p G T"]:
-    """The objective of every token with E_i / n at the place of the level and nothing after it."""
+    """The objective of every token, with another one at the place of the level and nothing after it."""
     place, at = jnp.arange(objective.shape[-1]), at[..., None]
-    return jnp.where(place < at, objective, jnp.where(place == at, exact[..., None], 0.0))
+    return jnp.where(place < at, objective, jnp.where(place == at, concluded, 0.0))
 
 
 def before_level(mask: Bool[Array, "*p G T"], at: Int[Array, "*p G"]) -> Bool[Array, "*p G T"]:

@@ -123,7 +123,8 @@ def policy_objective(
 ) -> tuple[Float[Array, "P G T"], Bool[Array, "P G T"], dict[str, Float[Array, "P"]]]:
     """c_t S_t of every token, where the clip cut its gradient off, and each prompt's mean E where it is enumerated.
 
-    With score centering A times `expected_score` is subtracted.  Arguments are those of `grpo_loss`.
+    With score centering A times `expected_score` is subtracted.  An enumerated conclusion that is not learned is kept:
+    its objective is −KL to the reference, for what the trace learns would move it.  Arguments are those of `grpo_loss`.
     """
     exact = None if levels is None else exact_levels(algorithm, terms, levels)
     trace = mask if levels is None else before_level(mask, levels.at)
@@ -138,8 +139,10 @@ def policy_objective(
     if levels is None or exact is None:
         return objective, clipped, {}
     expected = {"expected_reward": jnp.mean(exact.expected, -1)}
-    concluded = exact.objective if algorithm.learn_conclusion else jax.lax.stop_gradient(exact.objective)
-    return conclude_exactly(objective, concluded, levels.at), clipped, expected
+    if algorithm.learn_conclusion:
+        return conclude_exactly(objective, exact.objective[..., None], levels.at), clipped, expected
+    kept = jax.lax.stop_gradient(exact.objective)[..., None] - terms.reference_kl
+    return conclude_exactly(objective, kept, levels.at), clipped, expected
 
 
 def exact_levels(algorithm: Algorithm, terms: TokenTerms, levels: LevelRewards) -> ExactTerms:
