@@ -2,7 +2,7 @@
 
 A claim is a change between two arms of a run, paired over seeds with Student's interval, or a figure of the run that
 has an interval.  It *holds* where the interval lies on the claimed side, *does not hold* where it lies on the other,
-else it *cannot be told*; of several changes all must hold, and none may be reversed.
+else it is *undecided*; of several changes all must hold, and none may be reversed.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from touchr1_jax.bench.statistics import Interval, student_interval
 
 ATTRIBUTES = ("hardness", "roughness", "protrusion", "material")
 
-ClaimVerdict = Literal["holds", "does not hold", "cannot be told", "contradicts itself"]
+ClaimVerdict = Literal["holds", "does not hold", "undecided", "contradicts itself"]
 
 FOUR = ("h_acc", "r_acc", "p_acc", "mat_acc")  # whose mean the paper's ladder prints as Avg
 
@@ -58,7 +58,7 @@ class ClaimedChange:
     def verdict(self, found: Interval | None) -> ClaimVerdict:
         """Where the interval lies."""
         if found is None or not found.excludes_zero:
-            return "cannot be told"
+            return "undecided"
         return "holds" if (found.mean > 0) == (self.better == "higher") else "does not hold"
 
 
@@ -132,7 +132,7 @@ CLAIMS: tuple[Claim, ...] = (
         text="The consistency reward raises cross-sensor consistency",
         experiment="ablation_cumulative",
         changes=(_ladder("CSC", "consistency", "ordinal", "+ Consistency Reward", "+ Ordinal Reward", csc=True),),
-        why="It pays slots that agree: they echo each other, and conclusions by single sensors stay as they were.",
+        why="It rewards slots that agree: they copy each other, and the conclusions from single sensors do not change.",
     ),
     Claim(
         text="The format reward brings a small but stable gain",
@@ -242,14 +242,14 @@ CLAIMS: tuple[Claim, ...] = (
         text="Traces probe, compare and revise on their own",
         experiment="qualitative",
         published="two chosen examples",
-        fixed="cannot be told",
+        fixed="undecided",
         why="SFT teaches the form of the traces here, so nothing can emerge; every case is counted in the report.",
     ),
     Claim(
         text="Touch-R1 beats GPT-4o, Octopi, SToLa and VTV-LLM",
         experiment="paper_audit",
         published="+12.6 to +24.7 Avg",
-        fixed="cannot be told",
+        fixed="undecided",
         why="Neither weights, code, data nor answers are public; the gains on VTV150K lie within one run's noise.",
     ),
 )
