@@ -173,7 +173,7 @@ def write(root: Path = ROOT) -> Path:
     description = {
         "experiment": "reproduction",
         "scale": "recorded",
-        "git": {"commit": "see below", "dirty": False},
+        "git": {"commit": "several", "dirty": False},
         "recorded": runs,
     }
     about = "What of Touch-R1 (arXiv 2605.27154) holds?"

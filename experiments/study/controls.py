@@ -45,7 +45,8 @@ def control_sentences(comparisons: Sequence[Comparison], arms: Iterable[str]) ->
             continue
         sure = [c for c in of_arm if c.low > 0 or c.high < 0]
         gains = [c for c in sure if (c.difference > 0) == (REPORTED[c.metric].better == "higher")]
-        better, worse = (", ".join(map(change, found)) or "no metric" for found in (gains, set(sure) - set(gains)))
+        losses = [c for c in sure if c not in gains]
+        better, worse = (", ".join(map(change, found)) or "no metric" for found in (gains, losses))
         sentences.append(
             f"Compared with SFT continued for the same time, {arm} is better in {better} and worse in {worse} "
             f"({len(of_arm)} metrics; intervals over seeds that exclude 0)."

@@ -34,13 +34,11 @@ def change(c: Comparison) -> str:
     return f"{metric.title} {number(c.difference, spec)}{unit} {bounds(c.low, c.high, spec)}"
 
 
-def changes(found: Iterable[Comparison]) -> str:
-    """The differences whose intervals exclude 0, then those that are not significant."""
-    each = {
-        significant: [c for c in found if (c.low > 0 or c.high < 0) == significant] for significant in (True, False)
-    }
-    sure, unsure = (", ".join(map(change, each[significant])) for significant in (True, False))
-    return "; ".join(filter(None, (sure, f"not significant: {unsure}" if unsure else "")))
+def changes(found: Sequence[Comparison]) -> str:
+    """The differences whose intervals exclude 0, then the metrics whose differences are not significant."""
+    sure = [change(c) for c in found if c.low > 0 or c.high < 0]
+    unsure = [REPORTED[c.metric].title for c in found if c.low <= 0 <= c.high]
+    return "; ".join(filter(None, (", ".join(sure), f"not significant: {', '.join(unsure)}" if unsure else "")))
 
 
 def pooled(seeds: Sequence[Scores]) -> Scores:
