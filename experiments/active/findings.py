@@ -249,7 +249,7 @@ def harm_table(
     ]
     light = [light_first(world, f["chosen_harm"]) for f in seeds if "chosen_harm" in f]
     return named_table(
-        "Where harm has a price",
+        "Policies when harm has a price",
         rows,
         formats={"worth": ".1f", "right": ".1f", "past the limit": ".3f"},
         units={"worth": "points", "right": "%"},

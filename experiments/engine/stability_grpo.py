@@ -354,7 +354,7 @@ def failure_picture(outcomes: Sequence[ScenarioOutcome]) -> Picture:
         )
     return Picture(
         name="stability_grpo",
-        title="Share of seeds failed against the knob",
+        title="Share of failed seeds over the parameter",
         caption="Each panel drives one failure, from left to right; values are not to scale.  Dotted: share of seeds "
         "that raised the failure's alarm.",
         content=draw(panels, columns=4),

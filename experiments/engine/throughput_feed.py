@@ -319,7 +319,7 @@ def idle_share(batches: Batches, step_s: float, steps: int, context: Context, st
 def feed_table(config: FeedingConfig, fed: Sequence[FeedMeasurement]) -> Table:
     """Cost of the batches of every feed, and the rate at which the device needs them."""
     return named_table(
-        "What a batch takes, and what a device asks",
+        "Cost of a batch, and demand of a device",
         [
             {
                 "feed": one.name,

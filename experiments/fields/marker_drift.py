@@ -152,7 +152,7 @@ def _cycle_table(errors: DriftErrors, gel: str) -> Table:
         for name, by_cycle in errors.items()
     ]
     return named_table(
-        f"Off after so many cycles of {PERIOD} pictures, {gel}",
+        f"Drift after cycles of {PERIOD} pictures, {gel}",
         [{"method": name, **row} for name, row in zip(errors, rows, strict=True)],
         formats=dict.fromkeys(rows[0], ".4f"),
         units=dict.fromkeys(rows[0], "px"),

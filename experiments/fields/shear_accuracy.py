@@ -173,7 +173,7 @@ def layer_section() -> list[ReportPart]:
     worst, baseline = (max(by[name] for by in means.values()) for name in (MAIN, BASELINE))
     ratio = max(by[MAIN] / by[BASELINE] for by in means.values())
     table = named_table(
-        "Shear with a gel that is not what it is taken for (Tac3D's, generated)",
+        "Shear with wrong parameters of the gel (Tac3D, generated)",
         [{"method": name, **{layer: by[name] for layer, by in means.items()}} for name in next(iter(means.values()))],
         formats=dict.fromkeys(means, ".1f"),
         units=dict.fromkeys(means, "µm"),

@@ -138,7 +138,7 @@ def confusions(answers: JudgedAnswers) -> Picture:
     maps = [confusion_map(levels[:, a], truth[:, a], words[a], name) for a, name in enumerate(NAMES)]
     return Picture(
         name="confusions",
-        title="What is answered for each label",
+        title="Confusion matrices",
         caption="Share and number of videos, all partitions; each row sums to 100 %.",
         content=heatmaps(maps, x_label="answered", y_label="label", size=(9.0, 3.2)),
     )

@@ -68,7 +68,7 @@ def seconds_table(study: Study, context: Context) -> tuple[Table, ...]:
             rows.append({"policy": name, "seconds": float(np.mean(trained)), "seeds": len(trained)})
     if not rows:
         return ()
-    note = f"{CONTINUED} has as many steps as take the seconds of an arm where the ratio of their steps was measured."
+    note = f"{CONTINUED} has as many steps as fit into the time of an arm, by a ratio of step times measured before."
     formats = {"seconds": ".1f", "seeds": "d"}
     return (named_table("Seconds of training", rows, formats=formats, units={"seconds": "s"}, note=note),)
 
