@@ -201,5 +201,5 @@ def agents_table(settings: dict[str, dict[str, float]], steps: int) -> Table:
         "Agents of other libraries",
         [{"agent": name} | state | chosen for name, chosen in settings.items()],
         formats={"learning rate": "g", "entropy bonus": "g", "earned": ".3f"},
-        note="Settings that earned most about validation objects; the scores stand among the plans.",
+        note="Settings with the highest reward on validation objects; the scores are in the table of plans.",
     )

@@ -22,7 +22,7 @@ from experiments.core.results import (
     at_most,
     named_table,
 )
-from experiments.core.text import bounds
+from experiments.core.text import bounds, number
 from experiments.study.estimates import compare_over_objects, compare_over_seeds, estimate
 from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.bench.statistics import Interval
@@ -152,24 +152,25 @@ def verdict(
     """One sentence for one contact, one for several; none of them where the warm start cannot read a touch."""
     several = counted("chosen", contacts)
     mean = lambda name: f"{estimates[name][METRIC].mean:.1f} %"
-    against = lambda a, b: (c := named(comparisons, a, b)) and f"{c.difference:+.1f} {bounds(c.low, c.high)}"
+    against = lambda a, b: (
+        (c := named(comparisons, a, b)) and f"{number(c.difference, '+.1f')} {bounds(c.low, c.high, '+.1f')}"
+    )
     if named(comparisons, "by_question", "no_touch").low <= 0:
         return (
-            f"The warm start answers {mean('by_question')} after the best touch for each question, "
-            f"{against('by_question', 'no_touch')} points over no touch: it does not read touches, so that this run "
-            "does not answer how to choose them.",
+            f"The warm start answers {mean('by_question')} right after the best touch for each question, "
+            f"{against('by_question', 'no_touch')} points compared with no touch: it does not use touches, so that "
+            "this run does not show how to choose them.",
         )
-    number = np.mean([f[several].contacts.mean() for f in seeds])
+    touches = np.mean([f[several].contacts.mean() for f in seeds])
     return (
-        f"One touch chosen by a policy that learned from reward: {mean('chosen')} right, {against('chosen', 'random')} "
-        f"points over a touch at random, {against('chosen', 'best_fixed')} over the best touch for all questions, "
-        f"{against('chosen', 'by_question')} over the best touch for each question.",
-        f"Answered by the warm start, the same touches are {against('chosen_warm_answers', 'best_fixed')} over the "
-        f"best fixed one and {against('chosen_warm_answers', 'by_question')} over the best by question.",
-        f"Up to {contacts} touches at a price: {mean(several)} right with {number:.2f} touches, "
-        f"{against(several, f'best_fixed_{EQUAL}')} over the best fixed ones and "
-        f"{against(several, f'by_question_{EQUAL}')} over the best by question in the same time; every touch: "
-        f"{mean(EVERY_TOUCH)}.",
+        f"With one touch, the policy that learned from reward answers {mean('chosen')} right. Difference in points: "
+        f"{against('chosen', 'random')} from a random touch, {against('chosen', 'best_fixed')} from the best touch for "
+        f"all questions, {against('chosen', 'by_question')} from the best touch for each question.",
+        f"If the warm start answers after the same touches: {against('chosen_warm_answers', 'best_fixed')} from the "
+        f"best touch for all questions, {against('chosen_warm_answers', 'by_question')} from the best for each.",
+        f"With up to {contacts} touches that have a price: {mean(several)} right with {touches:.2f} touches on "
+        f"average; {against(several, f'best_fixed_{EQUAL}')} from the best touches for all questions in the same time, "
+        f"{against(several, f'by_question_{EQUAL}')} from the best for each. With all touches: {mean(EVERY_TOUCH)}.",
     )
 
 
@@ -214,7 +215,7 @@ def stop_table(seeds: Seeds, name: str) -> Table:
         most = seeds[0][name].choices.shape[-1]
         rows.append(
             {"question": question}
-            | {f"{k} contacts": 100 * float((number == k).mean()) for k in range(most + 1)}
+            | {f"{k} contact{'' if k == 1 else 's'}": 100 * float((number == k).mean()) for k in range(most + 1)}
             | {"right": 100 * float(np.mean([f[name].right[:, a].mean() for f in seeds]))}
         )
     figures = [column for column in rows[0] if column != "question"]
@@ -248,7 +249,7 @@ def harm_table(
     ]
     light = [light_first(world, f["chosen_harm"]) for f in seeds if "chosen_harm" in f]
     return named_table(
-        "Where harm has a price",
+        "Policies when harm has a price",
         rows,
         formats={"worth": ".1f", "right": ".1f", "past the limit": ".3f"},
         units={"worth": "points", "right": "%"},

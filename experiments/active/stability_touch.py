@@ -127,8 +127,8 @@ def verdict(found: dict[int, list[str]], alarms: dict[int, dict[str, int]]) -> s
     enough = sum(len(names) >= ENOUGH for names in found.values())
     rang = [f"{code} in seed {seed}" for seed, codes in alarms.items() for code in codes]
     return (
-        f"{enough} of {len(found)} seeds find the motion of at least {ENOUGH} of {len(PROPERTIES)} questions from "
-        f"reward alone; alarms: {', '.join(rang) or 'none'}."
+        f"{enough} of {len(found)} seeds learn from reward alone the best motion for at least {ENOUGH} of "
+        f"{len(PROPERTIES)} questions; alarms: {', '.join(rang) or 'none'}."
     )
 
 

@@ -12,8 +12,8 @@ from experiments.core.runs import PastRun, continuing
 from experiments.core.text import ABSENT, aligned, bounds, duration, interval, number
 from touchr1_jax.bench.statistics import student_interval
 
-Verdict = Literal["0 lies outside", "differs", "may be chance", "same"]
-"""With paired seeds: 0 lies outside the interval of the difference, or the difference may be chance; else `differs`.
+Verdict = Literal["significant", "differs", "not significant", "same"]
+"""With paired seeds a difference is significant if its 95 % interval excludes 0; without them it `differs`.
 
 The most important is the first."""
 
@@ -121,7 +121,7 @@ def _compare(a: Any, b: Any) -> tuple[str, Verdict]:
         return "", "same"
     if estimates and len(one) == len(two) > 1:
         found = student_interval(np.subtract(two, one))
-        return interval(found, "+.3g"), "0 lies outside" if found.excludes_zero else "may be chance"
+        return interval(found, "+.3g"), "significant" if found.excludes_zero else "not significant"
     if estimates:
         return number(b["mean"] - a["mean"], "+.3g"), "differs"
     if not all(isinstance(x, int | float) and not isinstance(x, bool) for x in (a, b)):
@@ -144,7 +144,7 @@ def _figures_block(found: Sequence[ComparedFigure], names: Sequence[str], most: 
     counts = Counter(f.verdict for f in found)
     verdicts = sorted(counts, key=rank)
     head = f"{len(found)} figures; " + "; ".join(f"{verdict}: {counts[verdict]}" for verdict in verdicts)
-    paired = counts["0 lies outside"] + counts["may be chance"]
+    paired = counts["significant"] + counts["not significant"]
     if paired:
         head += f" (of {paired} intervals, chance alone excludes 0 from {paired * CHANCE:.1f})"
     differing = sorted((f for f in found if f.verdict != "same"), key=lambda f: rank(f.verdict))

@@ -3,6 +3,7 @@
 import base64
 import itertools
 import json
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,11 @@ from experiments.core import curves
 from experiments.core.artifacts import write_bytes, write_text
 from experiments.core.context import read_metrics
 from experiments.core.look import colours
-from experiments.core.results import Cell, Column, Comparison, Results, Slot
+from experiments.core.results import Cell, Column, Comparison, Results, Slot, Table
 from experiments.core.text import MEANINGLESS, SMOKE, bounds, number, plain
 from touchr1_jax.bench.scoring import REPORTED
+
+_FIGURES = re.compile(r"[-+−–\d\s.,:;%×()\[\]]*")
 
 
 def write_report(directory: Path, results: Results, *, about: str, description: Mapping[str, Any]) -> Path:
@@ -79,9 +82,10 @@ def is_best(metric: str, arm: str, results: Results) -> bool:
 
 
 def _pairs(comparisons: Sequence[Comparison]) -> dict[tuple[str, str, str], dict[str, Comparison]]:
-    """Metric, arm, other arm → the comparison over seeds and over objects."""
+    """Metric, arm, other arm → the comparison over seeds and over objects, all pairs of a metric together."""
     pairs: dict[tuple[str, str, str], dict[str, Comparison]] = {}
-    for c in comparisons:
+    metrics = list(dict.fromkeys(c.metric for c in comparisons))
+    for c in sorted(comparisons, key=lambda c: metrics.index(c.metric)):
         pairs.setdefault((c.metric, c.arm, c.against), {})[c.over] = c
     return pairs
 
@@ -104,6 +108,12 @@ def cell_text(cell: Cell, column: Column) -> str:
     if isinstance(cell, bool):
         return "yes" if cell else "no"
     return cell if isinstance(cell, str) else number(cell, column.format if isinstance(cell, float) else ",")
+
+
+def word_columns(table: Table) -> list[bool]:
+    """For each column of a table whether its cells are words; figures, also those with intervals, are aligned right."""
+    cells = zip(*table.rows, strict=True)
+    return [any(isinstance(x, str) and not _FIGURES.fullmatch(x) for x in column) for column in cells]
 
 
 def pieces(text: str, slots: Sequence[Slot]) -> Iterator[tuple[str, str]]:
@@ -167,4 +177,5 @@ ENVIRONMENT.filters |= {
     "plain": plain,
     "png": png,
     "strip": strip,
+    "word_columns": word_columns,
 }

@@ -23,8 +23,15 @@ class WithInterval(Protocol):
 
 
 def number(value: float | None, spec: str = ".3g") -> str:
-    """A number by its format, with a true minus sign, which is as wide as a digit; a dash for `None`."""
-    return ABSENT if value is None else format(value, spec).replace("-", "−")
+    """A number by its format, with a true minus sign, which is as wide as a digit; a dash for `None`.
+
+    A negative number that rounds to zero is written without its sign.
+    """
+    if value is None:
+        return ABSENT
+    text = _with_true_minus(value, spec)
+    zero = text.startswith("−") and not any(digit in text for digit in "123456789")
+    return text.replace("−", "+" if "+" in spec else "", 1) if zero else text
 
 
 def interval(found: WithInterval | None, spec: str = ".3g") -> str:
@@ -33,8 +40,12 @@ def interval(found: WithInterval | None, spec: str = ".3g") -> str:
 
 
 def bounds(low: float, high: float, spec: str = ".3g") -> str:
-    """The ends of an interval, such as `[38.0, 60.1]`."""
-    return f"[{number(low, spec)}, {number(high, spec)}]"
+    """The ends of an interval, such as `[38.0, 60.1]`; their signs show whether 0 lies inside, also `[−0.0, 1.2]`."""
+    return f"[{_with_true_minus(low, spec)}, {_with_true_minus(high, spec)}]"
+
+
+def _with_true_minus(value: float, spec: str) -> str:
+    return format(value, spec).replace("-", "−")
 
 
 def plain(value: object) -> str:
@@ -46,7 +57,7 @@ def plain(value: object) -> str:
     if isinstance(value, Mapping):
         return ", ".join(f"{key} {plain(item)}" for key, item in value.items())
     if isinstance(value, list | tuple):
-        return ", ".join(plain(item) for item in value)
+        return ", ".join(plain(item) for item in value) or "none"
     return str(value)
 
 

@@ -83,7 +83,7 @@ def run(config: PretrainEncoderConfig, context: Context) -> Results:
     span = bounds(lead.low, lead.high, ".1f")
     return Results(
         verdict=(
-            f"On unseen objects the predicted latents have a skill of {interval(copied, '.2f')} over the last ones, "
+            f"On unseen objects the predicted latents have a skill of {interval(copied, '.2f')} over copying the last, "
             f"and of {interval(constant, '.2f')} over the mean latent of each step.",
             f"Linear probes are right in {after.accuracy:.1f} %, before training in {before.accuracy:.1f} %: "
             f"{interval(lead, '+.1f')} points.",

@@ -194,15 +194,16 @@ def report(config: StabilityEncoderConfig, outcomes: list[CollapseOutcome]) -> R
     cures = [(o, by[o.arm.cures]) for o in outcomes if o.arm.cures and by[o.arm.cures].failed.any()]
     return Results(
         verdict=(
-            f"{failed.sum()} of {len(failed)} runs collapsed; alarms during training noticed {noticed:.0%} of them and "
-            f"were raised in {false:.0%} of the others.",
+            f"{failed.sum()} of {len(failed)} runs collapsed; alarms during training detected {noticed:.0%} of them "
+            f"and were raised in {false:.0%} of the others.",
             *(
-                f"{o.arm.name}: {o.failed.mean():.0%} fail, of '{ill.arm.name}' {ill.failed.mean():.0%}."
+                f"Of '{o.arm.name}' {o.failed.mean():.0%} of the seeds collapse, of '{ill.arm.name}' "
+                f"{ill.failed.mean():.0%}."
                 for o, ill in cures
             ),
         ),
         requirements=(
-            at_least("failed runs that were noticed", 100 * noticed, 90.0, "%", of(alarmed & failed, failed)),
+            at_least("failed runs that were detected", 100 * noticed, 90.0, "%", of(alarmed & failed, failed)),
             at_most("sound runs with an alarm", 100 * false, 10.0, "%", of(alarmed & ~failed, ~failed)),
             at_most("failures with all guards", 100 * guarded, 10.0, "%", f"{config.seeds} seeds"),
         ),

@@ -350,7 +350,7 @@ def paper_table(config: VideoPredictionConfig, scores: Mapping[str, FrameScores]
         cells = dict(zip(columns.values(), values, strict=True))
         rows.append({"method": f"{name}: {inputs}, {s} ahead (paper)", **cells})
     return named_table(
-        "Beside the paper",
+        "Comparison with the paper",
         rows,
         formats=dict.fromkeys(columns.values(), ".3f"),
         meanings={"LPIPS": "only with weights given by the user"},

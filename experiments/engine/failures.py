@@ -102,7 +102,7 @@ SCENARIOS = (
         PAPER, _world("noise"), lambda run: run.after["middle"] - 1 / K > 0.25,
     ),
     FailureScenario(
-        "F2", "slots echo each other", "weight of consistency", (0.3, 0.7, 0.85, 0.9),
+        "F2", "slots copy each other", "weight of consistency", (0.3, 0.7, 0.85, 0.9),
         "all slots agree in more than 90 % and are right 10 points less often than before",
         PAPER, _hyperparameter("consistency"),
         lambda run: (run.after["echo_share"] > 0.9) & (run.gain("slots_right") < -0.1),
@@ -118,17 +118,17 @@ SCENARIOS = (
     ),
     FailureScenario(
         "F5", "the tactile bonus cancels", "weight of consistency, 0/1 accuracy", (0.8, 0.3, 0.0),
-        "of the groups that the bonus tells apart, more than half have the advantages of before",
+        "of the groups with different bonuses, more than half have the same advantages as without the bonus",
         LITERAL, _hyperparameter("consistency"), _bonus_cancels,
     ),
     FailureScenario(
         "F6", "tactile credit by chance", "share of right pictures, useless touch", (1.0, 0.6, 0.0),
-        "more than 14.6 % of the groups of a policy that stands still earn credit: 12 %, and two standard errors of "
+        "more than 14.6 % of the groups of an untrained policy earn credit: 12 %, and two standard errors of "
         "640 groups",
         LITERAL, _standing_still, lambda run: run.metrics["tactile_credit_share"].mean(1) > 0.146,
     ),
     FailureScenario(
-        "F7", "groups that teach nothing", "sharpness of the start (factor on logits)", (1.0, 2.0, 4.0, 16.0),
+        "F7", "groups of equal rewards", "sharpness of the start (factor on logits)", (1.0, 2.0, 4.0, 16.0),
         "more than half of the groups are constant and accuracy is more than 5 points below the start",
         PAPER, _world("sharp", ANCHORED),
         lambda run: (run.late("degenerate_share") > 0.5) & (run.gain("accuracy") < -0.05),
@@ -139,28 +139,28 @@ SCENARIOS = (
         SCORE_FUNCTION, _hyperparameter("beta"), lambda run: run.after["kl"] > 1.0,
     ),
     FailureScenario(
-        "F9", "entropy blows up", "weight of the entropy bonus", (0.03, 0.1, 0.3, 1.0),
+        "F9", "entropy grows without bound", "weight of the entropy bonus", (0.03, 0.1, 0.3, 1.0),
         "entropy more than .2 nat a token above the start, accuracy more than 10 points below",
         PAPER, _hyperparameter("entropy_weight"), lambda run: (run.gain("entropy") > 0.2) & _unlearns(run),
     ),
     FailureScenario(
-        "F9", "long steps end in one answer", "learning rate", (0.003, 0.01, 0.03, 0.1),
+        "F9", "large steps collapse to one answer", "learning rate", (0.003, 0.01, 0.03, 0.1),
         "accuracy more than 10 points below the start", PAPER, _hyperparameter("learning_rate"), _unlearns, ("F7",),
     ),
     FailureScenario(
-        "F10", "a stream that never arrives", "share of the second sensor's touch that arrives", (1.0, 0.3, 0.1, 0.0),
+        "F10", "a stream without influence", "share of the second sensor's touch that arrives", (1.0, 0.3, 0.1, 0.0),
         "noise in it moves no answer, and training goes on",
         PAPER, _world("kept"),
         lambda run: (run.after[f"grounding_{S - 1}"] <= ROUNDING_NAT) & (not run.refused),
     ),
     FailureScenario(
-        "F12", "time ids stand still", "frames a second", (1.0, 2.0, 4.0, 8.0),
+        "F12", "equal time indices", "frames a second", (1.0, 2.0, 4.0, 8.0),
         "the shuffle of steps can change less than half of the prompts",
         LITERAL, _time_ids, lambda run: run.after["shuffled"] < 0.5,
     ),
     FailureScenario(
-        "F13", "the parser is gamed", "credit for naming the answer among others", (0.0, 0.5, 0.75, 1.0),
-        "more than half of the answers name levels where they cannot be read",
+        "F13", "unparsable answers are rewarded", "credit for naming the answer among others", (0.0, 0.5, 0.75, 1.0),
+        "more than half of the answers name levels but cannot be parsed",
         PAPER, _lenience, lambda run: run.after["gamed_share"] > 0.5,
     ),
 )  # fmt: skip

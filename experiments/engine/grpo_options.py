@@ -118,18 +118,18 @@ def gain(runs: Runs, name: str) -> Interval:
 
 
 def option_verdict(runs: Runs) -> tuple[str, ...]:
-    """Name the options whose gain or loss of accuracy is beyond chance."""
+    """Name the options that change accuracy significantly: their interval over seeds excludes 0."""
     gains = {name: gain(runs, name) for name in runs if name != PUBLISHED.name}
     beyond = [f"{name} ({interval(one, '+.1f')} points)" for name, one in gains.items() if one.excludes_zero]
-    listed = f"beyond chance: {'; '.join(beyond)}" if beyond else "nothing is beyond chance"
-    return (f"Of {len(gains)} options, each alone, {listed}.",)
+    listed = f"these do: {'; '.join(beyond)}" if beyond else "none does"
+    return (f"Of {len(gains)} options that may change accuracy significantly (95 % over seeds), {listed}.",)
 
 
 def option_table(runs: Runs) -> Table:
     """Accuracy, its gain, and time of a step."""
     published = runs[PUBLISHED.name]
     return named_table(
-        "Options, each alone, in the world of touch",
+        "Options, each changed alone",
         [
             {
                 "option": name,

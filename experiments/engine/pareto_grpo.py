@@ -185,8 +185,13 @@ def verdict(config: ParetoGrpoConfig, curves: Curves) -> tuple[str, ...]:
         for name, group in sorted(seconds, key=seconds.__getitem__)
     ]
     return (
-        f"First at {config.target} is {timed[0]}." if timed else f"No setting reaches {config.target} with every seed.",
-        *([f"Not every seed passed it within {config.steps} steps with {', '.join(late)}."] if late and timed else []),
+        f"The fastest to a reward of {config.target} is {timed[0]}."
+        if timed
+        else f"No setting reaches {config.target} with every seed.",
+        *(
+            [f"Not with every seed in {config.steps} steps (algorithm, group): {', '.join(late)}."]
+            * bool(late and timed)
+        ),
     )
 
 

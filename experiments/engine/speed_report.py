@@ -25,13 +25,19 @@ Peers = Mapping[tuple[str, int], PeerTimes]  # (Peer, prefix) → its times
 
 def verdict(alone: Timings, twice: Mapping[int, Mapping[str, float]], peers: Peers) -> tuple[str, ...]:
     """Time of an iteration, gain of prefixes that are encoded once, comparison with other engines."""
-    times = ", ".join(f"{a.median_s:.3g} s at {prefix}" for prefix, a in alone.items())
-    gains = ", ".join(f"{ratios['repeated prefix']:.1f} × at {prefix}" for prefix, ratios in twice.items())
+    times = ", ".join(f"{a.median_s:.3g} s at {prefix} tokens" for prefix, a in alone.items())
+    gains = ", ".join(f"{ratios['repeated prefix']:.1f} at {prefix}" for prefix, ratios in twice.items())
     others = []
     for name in dict.fromkeys(name for name, _ in peers):
         ratios = {p: t.median_s / alone[p].median_s for (n, p), t in peers.items() if n == name}
-        others.append(f"{name} takes " + ", ".join(f"{r:.1f} × at {p}" for p, r in ratios.items()) + " as long.")
-    return f"One iteration takes {times}.", f"Repeating the prefix for every rollout takes {gains} as long.", *others
+        others.append(
+            f"{name} takes longer by a factor of " + ", ".join(f"{r:.1f} at {p}" for p, r in ratios.items()) + "."
+        )
+    return (
+        f"One iteration, by the length of the prefix: {times}.",
+        f"Encoding the prefix again for every rollout takes longer by a factor of {gains}.",
+        *others,
+    )
 
 
 def requirements(

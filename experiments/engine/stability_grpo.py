@@ -183,17 +183,17 @@ def verdict(outcomes: Sequence[ScenarioOutcome], undriven: Mapping[str, Sequence
     noticed = f"Alarms fired in {failed.mean():.0%} of {len(failed)} failed runs" if len(failed) else "No run failed"
     missed = [f"{o.name} ({n})" for o in outcomes if (n := int((~o.noticed(failed=True)).sum()))]
     plain = "; ".join(f"{name}: {_alarm_counts(runs)}" for name, runs in undriven.items())
-    held = len(provoked) - len(harmed)
+    avoided = len(provoked) - len(harmed)
     named = (
-        ("It failed too in", harmed),
+        ("`stable` failed too in", harmed),
         ("Not provoked:", [o.name for o in outcomes if not len(o.compared)]),
         ("Failed without an alarm:", missed),
     )
     return (
-        f"{len(provoked)} of {len(outcomes)} failures were provoked; stable held in {held} of them.",
+        f"{len(provoked)} of {len(outcomes)} failures were provoked; the preset `stable` avoids {avoided} of them.",
         *(f"{what} {'; '.join(names)}." for what, names in named if names),
         f"{noticed} and in {others.mean():.1%} of the {len(others)} others.",
-        f"Where nothing is driven, all alarms together: {plain}.",
+        f"Alarms without a provoked failure: {plain}.",
     )
 
 
@@ -230,11 +230,11 @@ def summary_table(outcomes: Sequence[ScenarioOutcome]) -> Table:
     """One line a scenario: the values at which either variant breaks, and how reliable the alarm is."""
     share = lambda flags: float(flags.mean()) if len(flags) else None
     return named_table(
-        "Where each breaks",
+        "Onset of each failure",
         [
             {
                 "failure": o.name,
-                "knob": f"{o.scenario.knob} ({o.scenario.failing.name})",
+                "parameter": f"{o.scenario.knob} ({o.scenario.failing.name})",
                 "breaks": o.failing.breaks_at(o.values),
                 "half": o.failing.breaks_at(o.values, 0.5),
                 "stable": o.stable.breaks_at(o.values),
@@ -247,7 +247,7 @@ def summary_table(outcomes: Sequence[ScenarioOutcome]) -> Table:
         ],
         formats={"breaks": "g", "half": "g", "stable": "g", "alarm": ".2f", "false": ".2f"},
         meanings={
-            "knob": "in brackets the variant that is compared with the stable preset",
+            "parameter": "in brackets the variant that is compared with the stable preset",
             "breaks": "first value at which any seed of that variant fails",
             "half": "first value at which more than half of them do",
             "failed": "runs of the stable preset that fail at values where the variant does",
@@ -267,8 +267,8 @@ def criterion_table(outcomes: Sequence[ScenarioOutcome]) -> Table:
         )
         seeds = dict(zip(("seeds failed", "of stable"), listed, strict=True))
         rows.append({"failure": o.name, "a seed has failed when": o.scenario.criterion, **seeds})
-    meanings = {"seeds failed": "at each value of the knob", "of stable": "the same under the stable preset"}
-    return named_table("What counts as failed", rows, meanings=meanings)
+    meanings = {"seeds failed": "at each value of the parameter", "of stable": "the same under the stable preset"}
+    return named_table("Criteria of failure", rows, meanings=meanings)
 
 
 def alarm_table(outcomes: Sequence[ScenarioOutcome]) -> Table:
@@ -283,22 +283,23 @@ def alarm_table(outcomes: Sequence[ScenarioOutcome]) -> Table:
                 "failure": o.name,
                 "alarm": ", ".join(bounds),
                 "failed": len(failed),
-                "noticed": int(failed.sum()),
+                "alarms": int(failed.sum()),
                 "number": float(np.median([f.value for f in firsts])) if firsts else None,
                 "step": float(np.median([f.step for f in firsts])) if firsts else None,
                 "others": len(others),
-                "struck": int(others.sum()),
+                "false alarms": int(others.sum()),
             }
         )
     return named_table(
-        "What the alarms said",
+        "Alarms",
         rows,
         formats={"number": ".2g", "step": ".0f"},
         meanings={
             "alarm": "codes of which any counts, with the bounds of their rules",
             "number": "that fired first, median over failed runs",
             "step": "at which it fired first, median over failed runs",
-            "struck": "runs that did not fail, whose alarm fired all the same",
+            "alarms": "failed runs whose alarm fired",
+            "false alarms": "runs that did not fail whose alarm fired",
         },
     )
 
@@ -353,7 +354,7 @@ def failure_picture(outcomes: Sequence[ScenarioOutcome]) -> Picture:
         )
     return Picture(
         name="stability_grpo",
-        title="Share of seeds failed against the knob",
+        title="Share of failed seeds over the parameter",
         caption="Each panel drives one failure, from left to right; values are not to scale.  Dotted: share of seeds "
         "that raised the failure's alarm.",
         content=draw(panels, columns=4),

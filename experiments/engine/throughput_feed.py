@@ -319,7 +319,7 @@ def idle_share(batches: Batches, step_s: float, steps: int, context: Context, st
 def feed_table(config: FeedingConfig, fed: Sequence[FeedMeasurement]) -> Table:
     """Cost of the batches of every feed, and the rate at which the device needs them."""
     return named_table(
-        "What a batch takes, and what a device asks",
+        "Cost of a batch, and demand of a device",
         [
             {
                 "feed": one.name,
@@ -349,8 +349,8 @@ def verdict(config: FeedingConfig, fed: Sequence[FeedMeasurement]) -> tuple[str,
     used = [one for one in fed if one.configured]
     worst, hardest = max(used, key=lambda one: one.idle), max(used, key=lambda one: one.cores)
     return (
-        "No accelerator was at work: what its steps take is predicted, and a stand-in waited for the batches.",
-        f"It stands still for at most {worst.idle:.2%} of the time ({worst.name}); the hardest to feed asks for "
+        "No accelerator was used: the time of its steps is predicted, and a simulated device waited for the batches.",
+        f"The device is idle for at most {worst.idle:.2%} of the time ({worst.name}); feeding needs at most "
         f"{hardest.cores:.2g} of {config.cores} cores ({hardest.name}).",
     )
 

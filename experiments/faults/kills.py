@@ -39,7 +39,7 @@ STEPPING = {
     "decoder": "decoder's SFT steps",
     "grpo": "GRPO steps",
     "blind": "blind SFT steps",
-    "count": "steps",
+    "count": "counting steps",
 }
 PHASES = (START, *STEPPING.values(), BETWEEN, CHECKPOINT)
 """Phases in which a kill can strike; between stages contacts are encoded, policies answer, the report is written."""

@@ -183,7 +183,7 @@ def account_table(outcomes: Mapping[str, ReplayOutcome]) -> Table:
     ]  # fmt: skip
     late = ("late, median", "late, p99")
     return named_table(
-        "The books against what was injected",
+        "Counted and injected losses",
         rows,
         formats=dict.fromkeys(late, ".2f"),
         units=dict.fromkeys(late, "ms"),

@@ -287,18 +287,18 @@ def verdict(
     readings = ", ".join(f"{sum(one.reading == name for one in flips)} {name}" for name in READINGS)
     worst = max(wait_s / steps_s for steps_s, wait_s in waited.values())
     return (
-        f"Killed by kill -9: {kills}.",
+        f"Killed by SIGKILL and resumed: {kills}.",
         f"Of {len(damage)} damaged files: {ends}.",
         f"Of {len(flips)} flipped bits: {readings}.",
-        f"Of {len(inputs)} kinds of bad input {sum(not row['faults'] for row in inputs)} are answered with error, "
-        f"place and way out.  At most {worst:.2%} of a training step waits for data.",
+        f"For {sum(not row['faults'] for row in inputs)} of {len(inputs)} kinds of bad input the error message names "
+        f"the place and a fix.  A training step waits for data in at most {worst:.2%} of its time.",
     )
 
 
 def kill_table(killed: Mapping[str, KilledRuns]) -> Table:
     """Kills by phase."""
     return named_table(
-        "Kills by what they struck",
+        "Kills by phase",
         [
             {"victim": name, "kills": len(each.kills), "runs": each.runs}
             | {phase: sum(k.phase == phase for k in each.kills) for phase in PHASES}
@@ -318,7 +318,7 @@ def damage_table(damage: Sequence[Damage]) -> Table:
     count = lambda same: {outcome: sum(one.outcome == outcome for one in same) for outcome in OUTCOMES}
     return named_table(
         "Damaged files of a resumed run",
-        [{"damage": kind, **count(same), "said": same[0].message[:CELL]} for kind, same in by_kind.items()],
+        [{"damage": kind, **count(same), "message": same[0].message[:CELL]} for kind, same in by_kind.items()],
         note="All files of the newer of two checkpoints, and those of the run that its next session reads.",
     )
 
@@ -375,7 +375,7 @@ def kill_picture(kills: Mapping[str, Sequence[Kill]]) -> Picture:
     ]
     return Picture(
         name="stability_faults",
-        title="Where the kills struck",
+        title="Phases of the kills",
         caption="Left: the phase of the session, from the files that it left on the disk. Right: the share of the run "
         "that had been logged by then.",
         content=draw(panels, columns=2),

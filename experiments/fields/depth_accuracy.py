@@ -191,8 +191,10 @@ def speed_section(made: Calibration, rounds: int, source: str) -> list[ReportPar
         "Hz",
         note=f"{ms:.2f} ms, degree {made.colours.degree} in colour, {made.colours.position_degree} in place",
     )
-    sentence = f"Depth and contact come at {speed.measured:.0f} Hz from pictures of {width} × {height} on one core"
-    return [f"{sentence}, by the map of {source}.", speed]
+    sentence = (
+        f"Depth and contact are computed at {speed.measured:.0f} Hz from pictures of {width} × {height} on one core"
+    )
+    return [f"{sentence}, with the calibration of {source}.", speed]
 
 
 def ball_requirements(
@@ -273,7 +275,11 @@ def integrator_section(rounds: Iterable[object]) -> list[ReportPart]:
         note="Other projects' integrators are reimplemented with the faults that they ship with.",
     )
     scale = at_most("scale of depth from analytic slopes, worst of centre and border", worst, MOST_SCALE, "%")
-    return [f"On analytic slopes the scale of depth is off by {worst:.2f} % at most, centre and border.", scale, table]
+    return [
+        f"On analytic slopes the error of the depth scale is at most {worst:.2f} %, at centre and border.",
+        scale,
+        table,
+    ]
 
 
 def known_depth_section(root: pathlib.Path, seed: int, context: Context) -> list[ReportPart]:

@@ -95,7 +95,10 @@ def pattern_section(data_dir: pathlib.Path, most: int, context: Context) -> list
     every = {name: _pattern_counts(data_dir, name, patterns[name], most) for name in context.each("patterns", patterns)}
     counts = _present(every, data_dir, list(patterns.values()))
     parts: list[ReportPart] = []
-    for folders, what in ((BARE_GELS, "bare gels taken for patterned ones"), (MARKER_GELS, "marker gels refused")):
+    for folders, what in (
+        (BARE_GELS, "Bare gels classified as patterned"),
+        (MARKER_GELS, "Marker gels classified as bare"),
+    ):
         of = [by for name, by in counts.items() if name in folders]
         total, bare = sum(by.total() for by in of), sum(by[Pattern.BARE] for by in of)
         wrong = total - bare if folders is BARE_GELS else bare
@@ -104,7 +107,7 @@ def pattern_section(data_dir: pathlib.Path, most: int, context: Context) -> list
             parts.append(at_most(what, wrong / total, 0.01, note=f"{wrong} of {total}"))
     truth = dict.fromkeys(MARKER_GELS, Pattern.MARKERS) | dict.fromkeys(BARE_GELS, Pattern.BARE)
     table = named_table(
-        "What each gel is taken for",
+        "Classification of gels",
         [{"folder": n, "truth": truth[n].value} | {p.value: by[p] for p in Pattern} for n, by in counts.items()],
         formats={p.value: "d" for p in Pattern},
         note="Every picture is classified as if it were the one at rest; most are under load, which is harder.",

@@ -116,8 +116,9 @@ def drift_section(
     own, alone, peer = (medians[name] for name in (MAIN, UNSMOOTHED, FRAME_TO_FRAME))
     pooled = lambda cycles: float(np.nanmedian(np.concatenate([errors[MAIN][cycles] for errors in drift.values()])))
     return [
-        f"After 1 and {max(cycles)} cycles {first}'s markers are off by {own[0]:.4f} and {own[2]:.4f} px (lower bound "
-        f"of a single marker's noise {bound:.4f} px); from frame to frame by {peer[0]:.3f} and {peer[2]:.3f} px.",
+        f"After 1 and {max(cycles)} cycles the drift of {first}'s markers is {own[0]:.4f} and {own[2]:.4f} px (lower "
+        f"bound of a single marker's noise {bound:.4f} px); tracking from frame to frame drifts by {peer[0]:.3f} and "
+        f"{peer[2]:.3f} px.",
         at_most(
             f"off after 900 pictures, as published ({first}, one picture at rest)",
             own[1],
@@ -151,7 +152,7 @@ def _cycle_table(errors: DriftErrors, gel: str) -> Table:
         for name, by_cycle in errors.items()
     ]
     return named_table(
-        f"Off after so many cycles of {PERIOD} pictures, {gel}",
+        f"Drift after cycles of {PERIOD} pictures, {gel}",
         [{"method": name, **row} for name, row in zip(errors, rows, strict=True)],
         formats=dict.fromkeys(rows[0], ".4f"),
         units=dict.fromkeys(rows[0], "px"),

@@ -149,7 +149,7 @@ def shear_section(data_dir: pathlib.Path | None, context: Context) -> list[Repor
     )
     return [
         *(
-            f"{sensor}: shear is off by {_mean(by[MAIN]):.1f} µm, by Helmholtz–Hodge {_mean(by[BASELINE]):.1f} µm."
+            f"{sensor}: error of shear {_mean(by[MAIN]):.1f} µm, with Helmholtz–Hodge {_mean(by[BASELINE]):.1f} µm."
             for sensor, by in errors.items()
         ),
         at_most("shear error over Helmholtz–Hodge's, worst sensor", ratio, 1.0),
@@ -173,7 +173,7 @@ def layer_section() -> list[ReportPart]:
     worst, baseline = (max(by[name] for by in means.values()) for name in (MAIN, BASELINE))
     ratio = max(by[MAIN] / by[BASELINE] for by in means.values())
     table = named_table(
-        "Shear with a gel that is not what it is taken for (Tac3D's, generated)",
+        "Shear with wrong parameters of the gel (Tac3D, generated)",
         [{"method": name, **{layer: by[name] for layer, by in means.items()}} for name in next(iter(means.values()))],
         formats=dict.fromkeys(means, ".1f"),
         units=dict.fromkeys(means, "µm"),
@@ -182,7 +182,7 @@ def layer_section() -> list[ReportPart]:
     )
     return [
         "With a gel up to 30 % thicker or thinner than assumed, and a Poisson ratio of 0.45 where 0.48 is assumed, "
-        f"shear is off by {worst:.1f} µm at worst, by Helmholtz–Hodge {baseline:.1f} µm.",
+        f"the error of shear is {worst:.1f} µm at worst, with Helmholtz–Hodge {baseline:.1f} µm.",
         at_most("shear error over Helmholtz–Hodge's, worst wrong layer", ratio, 1.0),
         table,
     ]

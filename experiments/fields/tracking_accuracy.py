@@ -118,7 +118,7 @@ def marker_section(gels: Sequence[MarkerGel], context: Context) -> list[ReportPa
         (Column(name="jump", format=".1%", meaning=lost), Column(name="all motions", format=".1%")),
     )
     return [
-        f"Markers are off by {median:.3f} px in the median, at {1e3 / ms[first][MARKER_DEFAULT]:.0f} Hz on {first}.",
+        f"Markers: median error {median:.3f} px, {1e3 / ms[first][MARKER_DEFAULT]:.0f} Hz on {first}.",
         at_most("marker error, median", median, 0.04, "px"),
         at_most("marker error, 95th percentile", high, 0.11, "px"),
         at_most("28 px jump: markers lost or > 1 px off, worst gel", worst_jump, 0.0),

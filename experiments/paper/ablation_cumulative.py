@@ -155,7 +155,7 @@ def requirements(found: ComponentComparison) -> tuple[Requirement, ...]:
     for metric in LADDER_METRICS:
         sizes = {e.step.arm: abs(e.seeds.mean) for e in found.effects if e.metric == metric}
         largest += sizes.get(SFT, 0.0) >= max(sizes.values())
-    note = "from the commonest levels, which stand for the paper's untrained base"
+    note = "from a constant answer, which replaces the paper's untrained base"
     name = "measures in which SFT is the largest step"
     return (*bounds, at_least(name, largest, len(LADDER_METRICS), note=note))
 
@@ -166,8 +166,8 @@ def verdict(found: ComponentComparison) -> tuple[str, ...]:
         return ("One seed: no step can be distinguished from chance; train two seeds at least.",)
     sentences = []
     for arm, metric, subject in (
-        (SFT, FOUR, "SFT over the commonest levels"),
-        ("ordinal", "omae", "Ordinal over 0/1 credit"),
+        (SFT, FOUR, "SFT compared with a constant answer"),
+        ("ordinal", "omae", "Ordinal compared with 0/1 credit"),
         ("consistency", "csc", "The consistency reward"),
         ("format", FOUR, "The format reward"),
         ("grounding", FOUR, "Tactile grounding"),
@@ -179,8 +179,8 @@ def verdict(found: ComponentComparison) -> tuple[str, ...]:
     count = collections.Counter(e.sign for e in found.effects)
     known = len(found.effects) - count["not in the paper"]
     sentences.append(
-        f"Of {known} signs of the paper {count['reproduced']} come out beyond chance, {count['opposite']} come out the "
-        f"other way, {count['undecided']} cannot be decided."
+        f"Of the signs of the paper's {known} changes {count['reproduced']} are reproduced, {count['opposite']} are "
+        f"opposite, {count['undecided']} are undecided."
     )
     return tuple(sentences)
 

@@ -91,15 +91,15 @@ def run(config: StudyConfig, context: Context) -> Results:
 
 
 def verdict(found: ComponentComparison) -> tuple[str, ...]:
-    """The components that are missed beyond chance, in accuracy, and those that are not."""
+    """The components whose omission changes accuracy significantly, and those without such an effect."""
     if not found.effects:
         return ("One seed: no effect can be distinguished from chance; train two seeds at least.",)
     effects = [e for e in found.effects if e.metric.metric == FOUR]
     clear = [e for e in effects if e.p_value < LEVEL]
-    missed = [f"{e.step.component} is missed: {e}." for e in clear if e.seeds.mean > 0]
-    better = [f"Without {e.step.component} answers are better: {e}." for e in clear if e.seeds.mean < 0]
+    missed = [f"{e.step.component} raises accuracy: {e}." for e in clear if e.seeds.mean > 0]
+    better = [f"{e.step.component} lowers accuracy: {e}." for e in clear if e.seeds.mean < 0]
     rest = ", ".join(e.step.component for e in effects if e not in clear)
-    return (*missed, *better, *([f"No difference in accuracy beyond chance: {rest}."] if rest else []))
+    return (*missed, *better, *([f"No significant effect on accuracy: {rest}."] if rest else []))
 
 
 EXPERIMENT = presets.paper_experiment("ablation_leave_one_out", presets.BENCH, presets.SCALES, run)

@@ -2,7 +2,7 @@
 
 A claim is a change between two arms of a run, paired over seeds with Student's interval, or a figure of the run that
 has an interval.  It *holds* where the interval lies on the claimed side, *does not hold* where it lies on the other,
-else it *cannot be told*; of several changes all must hold, and none may be reversed.
+else it is *undecided*; of several changes all must hold, and none may be reversed.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from touchr1_jax.bench.statistics import Interval, student_interval
 
 ATTRIBUTES = ("hardness", "roughness", "protrusion", "material")
 
-ClaimVerdict = Literal["holds", "does not hold", "cannot be told", "contradicts itself"]
+ClaimVerdict = Literal["holds", "does not hold", "undecided", "contradicts itself"]
 
 FOUR = ("h_acc", "r_acc", "p_acc", "mat_acc")  # whose mean the paper's ladder prints as Avg
 
@@ -58,7 +58,7 @@ class ClaimedChange:
     def verdict(self, found: Interval | None) -> ClaimVerdict:
         """Where the interval lies."""
         if found is None or not found.excludes_zero:
-            return "cannot be told"
+            return "undecided"
         return "holds" if (found.mean > 0) == (self.better == "higher") else "does not hold"
 
 
@@ -114,25 +114,25 @@ CLAIMS: tuple[Claim, ...] = (
         experiment="main_table",
         published="never compared",
         changes=(ClaimedChange(name="Avg of nine", metrics=("avg",), arm="full", against="sft_continued"),),
-        why="The control that the paper lacks: SFT continued for as many seconds.",
+        why="The paper lacks this control: SFT continued for the same time.",
     ),
     Claim(
         text="GRPO with 0/1 credit helps a little",
         experiment="ablation_cumulative",
         changes=(_ladder("Avg of four", "zero_one", "sft", "+ GRPO (0/1)", SFT_ROW),),
-        why="It asks about three properties and forgets the fourth, material.",
+        why="GRPO asks about three properties; accuracy on the fourth, material, falls.",
     ),
     Claim(
         text="The ordinal reward lowers OMAE",
         experiment="ablation_cumulative",
         changes=(_ladder("OMAE", "ordinal", "zero_one", "+ Ordinal Reward", "+ GRPO (0/1)", omae=True),),
-        why="Near misses are paid, so answers move to the middle level.",
+        why="Near misses are rewarded, so answers move to the middle level.",
     ),
     Claim(
         text="The consistency reward raises cross-sensor consistency",
         experiment="ablation_cumulative",
         changes=(_ladder("CSC", "consistency", "ordinal", "+ Consistency Reward", "+ Ordinal Reward", csc=True),),
-        why="It pays slots that agree: they echo each other, and conclusions by single sensors stay as they were.",
+        why="It rewards slots that agree: they copy each other, and the conclusions from single sensors do not change.",
     ),
     Claim(
         text="The format reward brings a small but stable gain",
@@ -153,7 +153,7 @@ CLAIMS: tuple[Claim, ...] = (
             _ladder("OMAE", "grounding", "sft", FULL_ROW, SFT_ROW, omae=True),
             _ladder("CSC", "grounding", "sft", FULL_ROW, SFT_ROW, csc=True),
         ),
-        why="Ordinal distance and consistency by single sensors are paid for, yet the second falls.",
+        why="Ordinal distance and consistency are rewarded, but the consistency of single sensors falls.",
     ),
     Claim(
         text="The gains spread over hardness, roughness, protrusion and material",
@@ -168,14 +168,14 @@ CLAIMS: tuple[Claim, ...] = (
             )
             for i, (metric, title) in enumerate(zip(FOUR, ATTRIBUTES, strict=True))
         ),
-        why="What GRPO is not asked about, material, is lost.",
+        why="Accuracy on material falls, about which GRPO asks no questions.",
     ),
     Claim(
         text="Credit for the use of touch helps",
         experiment="ablation_cumulative",
         published="no row",
         changes=(ClaimedChange(name="Avg of four", metrics=FOUR, arm="tactile_use", against="grounding"),),
-        why="The abstract names it, no equation and no ablation has it; built here as its words say.",
+        why="In the abstract, but in no equation and no ablation; implemented here as the abstract describes it.",
     ),
     Claim(
         text="Touch overrules a misleading picture",
@@ -191,7 +191,7 @@ CLAIMS: tuple[Claim, ...] = (
         why="On objects that look like others the policy follows touch; without touch it follows the picture.",
     ),
     Claim(
-        text="Right answers hang on the touch",
+        text="Right answers depend on touch",
         experiment="conflict",
         published="never measured",
         changes=(
@@ -225,7 +225,7 @@ CLAIMS: tuple[Claim, ...] = (
                 spec=".3f",
             ),
         ),
-        why="Better than copying. The paper's L1 has no known unit, so the figures do not compare.",
+        why="Better than copying. The unit of the paper's L1 is unknown, so the figures cannot be compared.",
     ),
     Claim(
         text="Pretraining on future frames captures contact",
@@ -236,20 +236,20 @@ CLAIMS: tuple[Claim, ...] = (
                 name="linear probes over a random encoder", path="requirements > probes over a random encoder"
             ),
         ),
-        why="Latents are predicted, but levels can be read from them no better than from an encoder without training.",
+        why="Latents are predicted, but probes on them are no better than on an untrained encoder.",
     ),
     Claim(
         text="Traces probe, compare and revise on their own",
         experiment="qualitative",
         published="two chosen examples",
-        fixed="cannot be told",
-        why="SFT teaches the form of the traces here, so nothing can emerge; every case is counted in the report.",
+        fixed="undecided",
+        why="SFT teaches the form of the traces here, so it cannot emerge; the report counts every case.",
     ),
     Claim(
         text="Touch-R1 beats GPT-4o, Octopi, SToLa and VTV-LLM",
         experiment="paper_audit",
         published="+12.6 to +24.7 Avg",
-        fixed="cannot be told",
+        fixed="undecided",
         why="Neither weights, code, data nor answers are public; the gains on VTV150K lie within one run's noise.",
     ),
 )

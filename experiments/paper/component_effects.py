@@ -24,7 +24,7 @@ FOUR = "four_acc"
 """Mean accuracy over hardness, roughness, protrusion and material: what the paper's ladder prints as Avg."""
 
 MOST = 0.5
-"""Share of seeds in which an alarm fires, of groups that teach nothing, or of entropy that is left: a failure shows."""
+"""Share of seeds in which an alarm fires, of groups of equal rewards, or of entropy that is left: a failure shows."""
 
 POINTS = 2.0  # change of a share, in points, that counts: about the spread between seeds
 
@@ -75,9 +75,9 @@ def diagnose(
 ) -> Iterator[str]:
     """The known failures that an arm shows against another, each with its code and the figures.
 
-    F1 the middle level is overpaid for being near everything; F2 slots echo each other for the consistency reward,
+    F1 ordinal credit favours the middle level; F2 slots copy each other for the consistency reward,
     which also drives the middle level out, since sensors disagree most about middle objects; F7 groups of equal rewards
-    teach nothing; F9 entropy collapses; F13 answers are paid that cannot be read; all others by the alarms.
+    give no gradient; F9 entropy collapses; F13 unparsable answers are rewarded; all others by the alarms.
 
     Args:
       history: the arm's training, if GRPO trained it.
@@ -95,19 +95,19 @@ def diagnose(
         if after["middle_rate"] - before["middle_rate"] > POINTS:
             yield f"F1: middle answers {middle}"
         if before["middle_rate"] - after["middle_rate"] > POINTS:
-            code, why = ("F2", "the consistency reward") if consistency else ("F9", "sharpening")
-            yield f"{code}: {why} drives the middle level out, {middle} of answers"
+            code, why = ("F2", "the consistency reward") if consistency else ("F9", "lower entropy")
+            yield f"{code}: {why} suppresses the middle level, {middle} of the answers"
     if {"csc_slot", "csc"} <= both:
         slots, right = (after[m] - before[m] for m in ("csc_slot", "csc"))
         if slots > POINTS and right < slots - POINTS:
-            yield f"F2: agreement of slots {slots:+.0f} points, right conclusions by single sensors {right:+.0f}"
+            yield f"F2: CSC-slot {slots:+.0f} points, CSC {right:+.0f}"
     if (degenerate := history.end.get("drawn_degenerate_share", history.end.get("degenerate_share", 0.0))) > MOST:
-        yield f"F7: {100 * degenerate:.0f} % of the groups earn one reward and teach nothing"
+        yield f"F7: in {100 * degenerate:.0f} % of the groups all rewards are equal, which gives no gradient"
     first, last = (steps.get("entropy", 0.0) for steps in (history.start, history.end))
     if "entropy" in history.end and first > 0 and last < MOST * first:
         yield f"F9: entropy {first:.3f} → {last:.3f} nat a token"
     if "parse_rate" in both and before["parse_rate"] - after["parse_rate"] > POINTS:
-        yield f"F13: answers that can be read {before['parse_rate']:.0f} → {after['parse_rate']:.0f} %"
+        yield f"F13: parsed answers {before['parse_rate']:.0f} → {after['parse_rate']:.0f} %"
 
 
 PRIMARY = {("SFT", FOUR), ("ordinal credit", "omae"), ("consistency", "csc")}
@@ -175,7 +175,7 @@ class ComponentEffect:
 
     @property
     def sign(self) -> SignVerdict:
-        """Agreement with the paper's sign: beyond chance over seeds and objects, against it, or neither."""
+        """Agreement with the paper's sign, significant over seeds and objects: reproduced, opposite, or undecided."""
         if self.published is None or self.published == 0:
             return "not in the paper"
         if self.p_value >= LEVEL:

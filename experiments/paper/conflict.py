@@ -226,8 +226,8 @@ def verdict(contrasts: Contrasts, revised: Mapping[str, float], gain: TouchGain 
         sentences.append(f"On all questions about {DISGUISED} it leads by {lead.seeds.mean:+.1f} points.")
     if gain is not None:
         sentences.append(
-            f"Touch is worth at least {interval(gain.least.gain, '.1f')} points, over {gain.least.control}; shuffled "
-            f"frames cost {gain.over[SHUFFLE].mean:.1f}."
+            f"Accuracy gains at least {interval(gain.least.gain, '.1f')} points from touch (least over the controls: "
+            f"{gain.least.control}); shuffling the frames costs {gain.over[SHUFFLE].mean:.1f}."
         )
     return tuple(sentences) or ("Too few objects look like others for a contrast; use more.",)
 

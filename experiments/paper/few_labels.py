@@ -324,7 +324,7 @@ def verdict(comparisons: Sequence[Comparison], counts: Sequence[int]) -> tuple[s
                 if found and all(c.high < 0 for c in found):
                     costs.append(f"{label} {found[0].difference:+.1f}")
         sentences.append(
-            f"{title[0].upper()}{title[1:]} raises accuracy beyond chance at {', '.join(pays) or 'no number of labels'}"
+            f"{title[0].upper()}{title[1:]} raises accuracy significantly at {', '.join(pays) or 'no number of labels'}"
             f" and lowers it at {', '.join(costs) or 'none'}."
         )
     return tuple(sentences)

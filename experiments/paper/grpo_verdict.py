@@ -242,8 +242,8 @@ def verdict(comparisons: Sequence[Comparison], arms: Sequence[str]) -> tuple[str
     differences = [c.difference for c in comparisons if c.metric == "acc" and c.over == "objects" and c.arm in arms]
     return (
         f"The claim that reinforcement improves a tactile policy {claim}: of {len(arms)} arms {len(better)} have a "
-        f"higher accuracy or a lower error than SFT continued for as many seconds, beyond chance over objects and over "
-        f"seeds, and {len(worse)} are worse in accuracy, error, material or agreement of single sensors.",
+        f"higher accuracy or a lower error than SFT continued for the same time (95 % intervals over objects and over "
+        f"seeds exclude 0), and {len(worse)} are worse in accuracy, error, material or agreement of single sensors.",
         f"The differences in accuracy lie between {min(differences):+.1f} and {max(differences):+.1f} points.",
     )
 

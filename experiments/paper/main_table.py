@@ -26,14 +26,13 @@ import numpy as np
 
 from experiments.core.context import Context
 from experiments.core.results import Comparison, Estimate, Results, at_most
-from experiments.core.text import bounds
 from experiments.paper import bench_scores as bench
 from experiments.paper import feature_baselines as features
 from experiments.paper import presets
 from experiments.paper.components import FULL, run_full_model
 from experiments.study import paper_numbers as paper
 from experiments.study.controls import against_control, control_sentences, decision_table, seconds_table
-from experiments.study.estimates import compare_over_seeds
+from experiments.study.estimates import changes, compare_over_seeds
 from experiments.study.examples import rollout_examples
 from experiments.study.levels import level_report
 from experiments.study.scores import PUBLISHED, baselines, level_answers, study_settings
@@ -152,17 +151,15 @@ def verdict(rows: Mapping[str, Mapping[str, Estimate]], comparisons: Sequence[Co
         f"a linear probe on the encoder of SFT {mean(ENCODER_PROBE):.1f}; the best without touch, {best}, "
         f"{mean(best):.1f}."
     ]
-    for c in comparisons:
-        if c.metric in ("avg", "omae", "csc") and c.against != CONTINUED:
-            chance = "0 lies outside" if c.low > 0 or c.high < 0 else "may be chance"
-            sentences.append(
-                f"{c.arm} against {c.against}: {c.metric} {c.difference:+.3g} {bounds(c.low, c.high)} ({chance})."
-            )
+    shown = [c for c in comparisons if c.metric in ("avg", "omae", "csc") and c.against != CONTINUED]
+    for arm, against in dict.fromkeys((c.arm, c.against) for c in shown):
+        of_pair = [c for c in shown if (c.arm, c.against) == (arm, against)]
+        sentences.append(f"{arm} compared with {against}: {changes(of_pair)}.")
     if "avg" in rows[FULL]:
         ours, theirs = rows[FULL]["avg"].mean, paper.MAIN["Touch-R1-7B"][1]
         sentences.append(
-            f"Its average is {ours:.1f}; a constant has {rows['constant']['avg'].mean:.1f}. The paper's {theirs} is of "
-            "another formula."
+            f"The full model's Avg is {ours:.1f}, that of a constant {rows['constant']['avg'].mean:.1f}. The paper's "
+            f"{theirs} follows another formula."
         )
     return tuple(sentences)
 

@@ -191,12 +191,12 @@ def phase_chart(found: Mapping[Lengths, PhaseResult]) -> bytes:
 
 def verdict(found: Mapping[Lengths, PhaseResult]) -> tuple[str, ...]:
     """The efficient combinations in their order."""
-    told = ", ".join(
+    listed = ", ".join(
         f"{steps} {phase} + {decoder}: {found[phase, steps, decoder].accuracy:.1f} % in "
         f"{found[phase, steps, decoder].seconds:.0f} s"
         for phase, steps, decoder in efficient(found)
     )
-    return (f"Efficient combinations of steps of the encoders and of the decoder alone: {told}.",)
+    return (f"Efficient combinations of steps of the encoders and of the decoder alone: {listed}.",)
 
 
 EXPERIMENT = Experiment(

@@ -150,8 +150,8 @@ def answer_cases(
         case("Sensors disagree, the conclusion is right", right, split),
         case("Sensors disagree, the conclusion is wrong", ~right, split),
         case("Two levels off", two_off, questions.ordinal),
-        case("GRPO corrects what SFT had wrong", right, sft != questions.label),
-        case("GRPO spoils what SFT had right", ~right, sft == questions.label),
+        case("GRPO corrects a wrong answer of SFT", right, sft != questions.label),
+        case("GRPO makes a right answer of SFT wrong", ~right, sft == questions.label),
         case("Cannot be read", ~read, np.ones_like(read)),
     )  # fmt: skip
 

@@ -2,8 +2,8 @@
 
     python -m experiments.paper.reproduction        # REPRODUCTION.md, its figure, and runs/reproduction/report.html
 
-Statements that the paper's own numbers contradict come from `paper_audit`.  A claim without a recorded run cannot be
-told.  A test compares REPRODUCTION.md with what this module would write.
+Statements that the paper's own numbers contradict come from `paper_audit`.  A claim without a recorded run is
+undecided.  A test compares REPRODUCTION.md with what this module would write.
 """
 
 import dataclasses
@@ -50,7 +50,7 @@ def outcomes(root: Path = ROOT) -> tuple[ClaimOutcome, ...]:
     """The outcome of every claim by the runs that a checkout has recorded, then the paper's own inconsistencies."""
     found = [_outcome(claim, _recorded(claim.experiment, root)) for claim in CLAIMS]
     for check in inconsistencies():
-        verdict: ClaimVerdict = "contradicts itself" if check.verdict == "contradiction" else "cannot be told"
+        verdict: ClaimVerdict = "contradicts itself" if check.verdict == "contradiction" else "undecided"
         found.append(
             ClaimOutcome(
                 claim=check.title,
@@ -70,8 +70,8 @@ def _outcome(claim: Claim, run: Mapping[str, Any] | None) -> ClaimOutcome:
     decided: ClaimVerdict = claim.fixed or "holds"
     if claim.fixed is None and "does not hold" in verdicts:
         decided = "does not hold"
-    elif claim.fixed is None and "cannot be told" in verdicts:
-        decided = "cannot be told"
+    elif claim.fixed is None and "undecided" in verdicts:
+        decided = "undecided"
     published = claim.published or "; ".join(f"{c.name} {number(c.paper, c.spec)}" for c in claim.changes)
     ours = "; ".join(f"{c.name} {interval(found, c.spec)}" for c, found in measured) or "–"
     return ClaimOutcome(
@@ -90,7 +90,7 @@ def summary(found: tuple[ClaimOutcome, ...]) -> str:
     doubts = sum(o.verdict == "contradicts itself" for o in found)
     return (
         f"Of {len(of)} claims {of.count('holds')} hold, {of.count('does not hold')} do not, "
-        f"{of.count('cannot be told')} cannot be told. In {doubts} places the paper contradicts itself."
+        f"{of.count('undecided')} are undecided. In {doubts} places the paper contradicts itself."
     )
 
 
@@ -173,7 +173,7 @@ def write(root: Path = ROOT) -> Path:
     description = {
         "experiment": "reproduction",
         "scale": "recorded",
-        "git": {"commit": "see below", "dirty": False},
+        "git": {"commit": "several", "dirty": False},
         "recorded": runs,
     }
     about = "What of Touch-R1 (arXiv 2605.27154) holds?"

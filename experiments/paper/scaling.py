@@ -22,7 +22,7 @@ import numpy as np
 
 from experiments.core.context import Context
 from experiments.core.results import Estimate, Picture, Results, RolloutExample
-from experiments.core.text import bounds
+from experiments.core.text import bounds, number
 from experiments.core.timing import interleaved
 from experiments.paper import bench_scores as bench
 from experiments.paper import model_sizes as sizes
@@ -181,21 +181,22 @@ def verdict(
     )
     times = costs["large"].sft_s / costs["small"].sft_s
     sentences = [
-        f"The full model answers {shares} right; a step of SFT of the largest takes {times:.1f} times the smallest's."
+        f"The full model answers {shares} right; an SFT step of the largest takes {times:.1f} times as long as one of "
+        "the smallest."
     ]
     by = {t.metric: t for t in trends if t.policy == POLICIES[FULL]}
     for metric in DRAWN:
         if metric in by:
             slope = by[metric].slope
             sentences.append(
-                f"A doubling of the parameters changes its {REPORTED[metric].title} by {slope.mean:+.2g} "
+                f"A doubling of the parameters changes its {REPORTED[metric].title} by {number(slope.mean, '+.2g')} "
                 f"{bounds(slope.low, slope.high, '.2g')} ({by[metric].larger_is})."
             )
     claimed = [by[metric] for metric in sizes.CLAIMED if metric in by]
     if claimed:
         count = sum(trend.larger_is == "better" for trend in claimed)
         sentences.append(
-            f"Of the {len(claimed)} metrics that grow clearly in the paper, {count} do here beyond chance."
+            f"Of the {len(claimed)} metrics that grow clearly in the paper, {count} grow significantly here."
         )
     return tuple(sentences)
 

@@ -300,7 +300,8 @@ def verdict(
     ]
     if gain is not None:
         sentences.append(
-            f"Touch is worth at least {interval(gain.least.gain, '.1f')} points, over {gain.least.control}."
+            f"Accuracy gains at least {interval(gain.least.gain, '.1f')} points from touch (least over the controls: "
+            f"{gain.least.control})."
         )
     if config.weights is None:
         sentences.insert(0, TAUGHT if config.teaching_steps else DRAWN)

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from experiments.core.charts import Panel, Series, draw, estimates
 from experiments.core.pictures import heatmaps
 from experiments.core.results import Picture, Table, named_table
+from experiments.core.text import bounds
 from experiments.recordings.cross_validation import (
     CrossValidation,
     confidence,
@@ -100,13 +101,14 @@ def people_table(found: Mapping[int, np.ndarray], videos: DescribedVideos) -> Ta
     rows = list[dict[str, Any]]()
     for a, level in found.items():
         right = clustered_bootstrap(100.0 * (level == videos.label[:, a]), videos.objects)
-        rows.append({"attribute": NAMES[a], "right": right.mean, "95 %": f"{right.low:.1f}–{right.high:.1f}"})
+        rows.append({"attribute": NAMES[a], "right": right.mean, "95 %": bounds(right.low, right.high, ".1f")})
     if found:
         both = np.all([level == videos.label[:, a] for a, level in found.items()], 0)
         right = clustered_bootstrap(100.0 * both, videos.objects)
-        rows.append({"attribute": "all rated", "right": right.mean, "95 %": f"{right.low:.1f}–{right.high:.1f}"})
+        rows.append({"attribute": "all rated", "right": right.mean, "95 %": bounds(right.low, right.high, ".1f")})
     note = "Ratings of 0 to 10, cut at two thresholds that fit all other objects best; bumps were not rated."
-    return named_table("People", rows or [{"attribute": "none rated", "right": 0.0, "95 %": ""}], note=note)
+    none = [{"attribute": "none rated", "right": None, "95 %": None}]
+    return named_table("People", rows or none, formats={"right": ".1f"}, units={"right": "%", "95 %": "%"}, note=note)
 
 
 def object_table(videos: DescribedVideos, answers: JudgedAnswers, pooled: JudgedAnswers) -> Table:
@@ -136,7 +138,7 @@ def confusions(answers: JudgedAnswers) -> Picture:
     maps = [confusion_map(levels[:, a], truth[:, a], words[a], name) for a, name in enumerate(NAMES)]
     return Picture(
         name="confusions",
-        title="What is answered for each label",
+        title="Confusion matrices",
         caption="Share and number of videos, all partitions; each row sums to 100 %.",
         content=heatmaps(maps, x_label="answered", y_label="label", size=(9.0, 3.2)),
     )
@@ -163,7 +165,7 @@ def abstention(answers: JudgedAnswers) -> Picture:
     panels.append(Panel(curves, title="Calibration", x_limits=(0, 105), y_limits=(0, 100), **axes))
     return Picture(
         name="abstention",
-        title="What it is sure of is more often right",
+        title="Abstention and calibration",
         caption="Bands are 95 % intervals over objects; all partitions.",
         content=draw(panels, size=(9.0, 3.6)),
     )
@@ -189,13 +191,15 @@ def sim_to_real(split: CrossValidation) -> tuple[Picture, Table]:
             rows.append({"learned from": name, "real objects": k} | {key: one.mean for key, one in measured.items()})
     formats = {key: ".3f" if key == "OMAE" else ".1f" for key in rows[0] if key not in ("learned from", "real objects")}
     note = "Probes alone, on the partition that settings were chosen on."
-    table = named_table("From scenes to real objects", rows, formats=formats | {"real objects": "d"}, note=note)
+    units = {key: "levels" if key == "OMAE" else "%" for key in formats}
+    formats |= {"real objects": "d"}
+    table = named_table("From scenes to real objects", rows, formats=formats, units=units, note=note)
     series = [estimates(name, [*at.values()], at=[*at]) for name, at in found.items()]
     axes: dict[str, Any] = {"x_label": "real objects learned from", "y_label": "levels right (%)"}
     panel = Panel(series, x_limits=(-2, None), y_limits=(30, 80), x_ticks={k: str(k) for k in counts}, **axes)
     picture = Picture(
         name="sim_to_real",
-        title="What scenes teach, and what real objects add",
+        title="Training on scenes and on real objects",
         caption=note + "  Bars are 95 % intervals over objects.",
         content=draw([panel], size=(6.4, 3.6)),
     )

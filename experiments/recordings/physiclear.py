@@ -273,13 +273,16 @@ def verdict(
     partitions: int,
 ) -> tuple[str, ...]:
     """The scores on unseen objects from one video and from all, and the gain over logistic regression."""
-    percent = lambda found: ", ".join(f"{name} {interval(found[name], '.1f')} %" for name in ("all right", "mean"))
+    right = lambda found: (
+        f"all three levels are right in {interval(found['all right'], '.1f')} %, single levels in "
+        f"{interval(found['mean'], '.1f')} %; OMAE {found['OMAE'].mean:.2f}"
+    )
     return (
-        f"Of {len(videos.names)} videos of {len(np.unique(videos.objects))} objects that it never touched, the policy "
-        f"answers right: {percent(main)}; {main['OMAE'].mean:.2f} levels off on average (mean of {partitions} "
-        f"partitions).",
-        f"From all videos of the object: {percent(pooled)}; {pooled['OMAE'].mean:.2f} levels off.",
-        f"Over logistic regression on hand features: mean {interval(gain['mean'], '+.1f')} points.",
+        f"From one of {len(videos.names)} videos of {len(np.unique(videos.objects))} unseen objects (mean of "
+        f"{partitions} partitions): {right(main)}.",
+        f"From all videos of an object: {right(pooled)}.",
+        f"Compared with logistic regression on hand-made features: {interval(gain['mean'], '+.1f')} points of single "
+        "levels.",
     )
 
 

@@ -8,9 +8,8 @@ import numpy as np
 from experiments.core.context import Context
 from experiments.core.results import Comparison, Estimate, Results
 from experiments.core.runner import Experiment
-from experiments.core.text import bounds
 from experiments.study.controls import against_control, control_sentences, decision_table, seconds_table
-from experiments.study.estimates import compare_over_objects, compare_over_seeds
+from experiments.study.estimates import change, changes, compare_over_objects, compare_over_seeds
 from experiments.study.examples import rollout_examples
 from experiments.study.levels import level_report
 from experiments.study.scores import Scored, score_study, study_results, study_settings
@@ -153,23 +152,14 @@ def verdict(
 ) -> tuple[str, ...]:
     """One sentence for SFT, one for each pair, and one for each arm against SFT, whichever way the figures fall."""
     by = {(c.metric, c.arm, c.against): c for c in comparisons}
-    touch = (by["acc", SFT, name] for name in ("constant", BLIND))
-    gains = ", ".join(f"{c.difference:+.1f} points {_interval(c)} against {c.against}" for c in touch)
+    gains = ", ".join(f"{change(by['acc', SFT, name])} compared with {name}" for name in ("constant", BLIND))
     sentences = [f"SFT answers {rows[SFT]['acc'].mean:.1f} % of ordinal questions about unseen objects right: {gains}."]
     for a, b in ablation.pairs:
         found = [by[m, a, b] for m in COMPARED if (m, a, b) in by]
         if found:
-            changes = ", ".join(f"{c.metric} {c.difference:+.3g} {_interval(c)}" for c in found)
-            sentences.append(f"{a} against {b}: {changes}.")
+            sentences.append(f"{a} compared with {b}: {changes(found)}.")
     for arm in ablation.arms:
         if (OWN_REWARD, arm, SFT) in by:
-            reward, accuracy = by[OWN_REWARD, arm, SFT], by["acc", arm, SFT]
-            sentences.append(
-                f"GRPO of {arm} changes its own reward on unseen objects by {reward.difference:+.4f} "
-                f"{_interval(reward)} and accuracy by {accuracy.difference:+.1f} points {_interval(accuracy)}."
-            )
+            found = [by[metric, arm, SFT] for metric in (OWN_REWARD, "acc")]
+            sentences.append(f"GRPO of {arm} compared with SFT, on unseen objects: {changes(found)}.")
     return tuple(sentences)
-
-
-def _interval(c: Comparison) -> str:
-    return bounds(c.low, c.high) + ("" if c.low > 0 or c.high < 0 else " (may be chance)")

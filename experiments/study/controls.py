@@ -8,9 +8,8 @@ import numpy as np
 from experiments.core.context import Context
 from experiments.core.loops import STEPPING
 from experiments.core.results import Cell, Comparison, Estimate, Table, named_table
-from experiments.core.text import bounds
 from experiments.study.answers import asked_label, concluded
-from experiments.study.estimates import compare_over_seeds, object_interval
+from experiments.study.estimates import change, compare_over_seeds, object_interval
 from experiments.study.study import CONTINUED, Study
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.metrics import BOTTOM, ORDINAL
@@ -38,7 +37,7 @@ def against_control(rows: Mapping[str, Mapping[str, Estimate]], arms: Iterable[s
 
 
 def control_sentences(comparisons: Sequence[Comparison], arms: Iterable[str]) -> tuple[str, ...]:
-    """For each arm the metrics in which it is better or worse than SFT continued beyond chance over seeds."""
+    """For each arm the metrics in which it is significantly better or worse than SFT continued."""
     sentences = []
     for arm in arms:
         of_arm = [c for c in comparisons if c.arm == arm and c.against == CONTINUED and c.over == "seeds"]
@@ -46,11 +45,11 @@ def control_sentences(comparisons: Sequence[Comparison], arms: Iterable[str]) ->
             continue
         sure = [c for c in of_arm if c.low > 0 or c.high < 0]
         gains = [c for c in sure if (c.difference > 0) == (REPORTED[c.metric].better == "higher")]
-        told = lambda found: ", ".join(f"{c.metric} {c.difference:+.3g} {bounds(c.low, c.high)}" for c in found)
         losses = [c for c in sure if c not in gains]
+        better, worse = (", ".join(map(change, found)) or "no metric" for found in (gains, losses))
         sentences.append(
-            f"Against SFT continued for as many seconds, {arm} is better in {told(gains) or 'no metric'} and worse in "
-            f"{told(losses) or 'no metric'}, of {len(of_arm)} metrics, beyond chance over seeds."
+            f"Compared with SFT continued for the same time, {arm} is better in {better} and worse in {worse} "
+            f"({len(of_arm)} metrics; intervals over seeds that exclude 0)."
         )
     return tuple(sentences)
 
@@ -69,7 +68,7 @@ def seconds_table(study: Study, context: Context) -> tuple[Table, ...]:
             rows.append({"policy": name, "seconds": float(np.mean(trained)), "seeds": len(trained)})
     if not rows:
         return ()
-    note = f"{CONTINUED} has as many steps as take the seconds of an arm where the ratio of their steps was measured."
+    note = f"{CONTINUED} has as many steps as fit into the time of an arm, by a ratio of step times measured before."
     formats = {"seconds": ".1f", "seeds": "d"}
     return (named_table("Seconds of training", rows, formats=formats, units={"seconds": "s"}, note=note),)
 

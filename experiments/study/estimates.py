@@ -7,7 +7,7 @@ import numpy as np
 
 from experiments.core.errors import require
 from experiments.core.results import Comparison, Estimate
-from experiments.core.text import interval
+from experiments.core.text import bounds, interval, number
 from touchr1_jax.bench import statistics
 from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.bench.scoring import REPORTED
@@ -24,6 +24,21 @@ def object_interval(values: np.ndarray, objects: np.ndarray, spec: str = ".1f") 
     if len(np.unique(objects)) < 2:
         return None
     return interval(statistics.clustered_bootstrap(values.astype(float), objects, resamples=RESAMPLES // 2), spec)
+
+
+def change(c: Comparison) -> str:
+    """The difference in a metric, by its title and with its interval: `CSC −0.8 points [−1.2, −0.4]`."""
+    metric = REPORTED[c.metric]
+    unit = f" {'points' if metric.unit == '%' else metric.unit}" if metric.unit else ""
+    spec = f"+{metric.format}"
+    return f"{metric.title} {number(c.difference, spec)}{unit} {bounds(c.low, c.high, spec)}"
+
+
+def changes(found: Sequence[Comparison]) -> str:
+    """The differences whose intervals exclude 0, then the metrics whose differences are not significant."""
+    sure = [change(c) for c in found if c.low > 0 or c.high < 0]
+    unsure = [REPORTED[c.metric].title for c in found if c.low <= 0 <= c.high]
+    return "; ".join(filter(None, (", ".join(sure), f"not significant: {', '.join(unsure)}" if unsure else "")))
 
 
 def pooled(seeds: Sequence[Scores]) -> Scores:

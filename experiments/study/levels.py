@@ -46,7 +46,7 @@ def level_report(study: Study) -> tuple[tuple[Picture, ...], tuple[Table, ...]]:
     words = {n: [level[0] for level in language.attributes[language.attribute_index(n)].levels] for n in ORDINAL}
     confusions = Picture(
         name="confusions",
-        title="Which level is taken for which",
+        title="Confusion matrices",
         caption="Share of each answer among the test questions with one label, and their number; seeds pooled.",
         content=confusion_chart(rows, words),
     )
@@ -59,7 +59,7 @@ def level_report(study: Study) -> tuple[tuple[Picture, ...], tuple[Table, ...]]:
         with_agreement = {name: rows[name] for name in (SFT, list(study.arms)[-1]) if name in with_agreement}
     trust = Picture(
         name="trust",
-        title="How far an answer can be trusted",
+        title="Accuracy by agreement of the sensors",
         caption="Right answers by the number of sensors that, given alone, lead to the same answer as all together; "
         "areas are shares of the answers, lines 95 % over objects; hardness, roughness, protrusion and all seeds "
         "pooled.",
@@ -115,19 +115,19 @@ def reliability_table(rows: Mapping[str, LevelAnswers], words: Words) -> Table:
                 {
                     "policy and level": f"{name}: {attribute} {level}",
                     "answered": 100 * float(np.mean(answer == k)),
-                    "right when answered": object_interval(100.0 * (label == k)[answer == k], objects[answer == k]),
-                    "found where true": object_interval(100.0 * (answer == k)[label == k], objects[label == k]),
+                    "precision": object_interval(100.0 * (label == k)[answer == k], objects[answer == k]),
+                    "recall": object_interval(100.0 * (answer == k)[label == k], objects[label == k]),
                 }
                 for k, level in enumerate(levels)
             ]
     return named_table(
-        "Reliability of the levels",
+        "Precision and recall of each level",
         lines,
         formats={"answered": ".1f"},
-        units=dict.fromkeys(("answered", "right when answered", "found where true"), "%"),
+        units=dict.fromkeys(("answered", "precision", "recall"), "%"),
         meanings={"answered": "of all questions about the attribute"}
-        | dict.fromkeys(("right when answered", "found where true"), "95 % over objects"),
-        note="An answer that favours a level finds it often and is right about it seldom.",
+        | dict.fromkeys(("precision", "recall"), "95 % over objects"),
+        note="A policy that favours a level has a high recall and a low precision on it.",
     )
 
 
@@ -175,7 +175,7 @@ def sampled_report(study: Study) -> tuple[tuple[Picture, ...], tuple[Table, ...]
         return (), ()
     picture = Picture(
         name="calibration",
-        title="How sure the policies are, and how often they are right",
+        title="Calibration",
         caption="Right majority answers over the share of the samples that agree with them; seeds pooled, areas are "
         "shares of the questions.  A calibrated policy lies on the diagonal.",
         content=calibration_chart({name: pooled_votes(seeds) for name, seeds in rows.items()}),

@@ -96,17 +96,19 @@ def with_rule(picture: np.ndarray, width_mm: float | None) -> np.ndarray:
     ends = (left, low), (left + round(length_mm / width_mm * picture.shape[1]), low)
     for colour, width in ((_HALO, 4 * unit), (_INK, 2 * unit)):
         cv2.line(picture, *ends, colour, round(width))
-    return _written(picture, f"{length_mm:g} mm", (left, low - round(7 * unit)))
+    return _written(picture, f"{length_mm:g} mm", (left, low - round(7 * unit)), unit)
 
 
 def with_bar(picture: np.ndarray, top_mm: float) -> np.ndarray:
     """The picture beside the colours from 0 to `top_mm`, with both numbers."""
     height, unit = picture.shape[0], picture.shape[1] / _DRAWN_PX
-    bar = np.full((height, round(64 * unit), 3), _HALO, np.uint8)
+    top, left = f"{top_mm:g} mm", round(21 * unit)
+    (width, _), _ = cv2.getTextSize(top, _FONT, _FONT_SCALE * unit, round(3 * unit))
+    bar = np.full((height, left + width + round(4 * unit), 3), _HALO, np.uint8)
     colours = coloured(np.linspace(np.full(_LEAST_SIDE, top_mm), 0, height), top_mm)
     bar[:, round(6 * unit) : round(18 * unit)] = colours[:, :1]
-    _written(bar, f"{top_mm:g} mm", (round(21 * unit), round(14 * unit)))
-    _written(bar, "0", (round(21 * unit), height - round(5 * unit)))
+    _written(bar, top, (left, round(14 * unit)), unit)
+    _written(bar, "0", (left, height - round(5 * unit)), unit)
     return np.hstack([picture, bar])
 
 
@@ -117,9 +119,8 @@ def _drawn(
     return with_bar(with_rule(draw(field, top_mm), width_mm), top_mm)
 
 
-def _written(picture: np.ndarray, words: str, at: tuple[int, int]) -> np.ndarray:
-    """The picture with words, white in a dark halo, in place."""
-    unit = picture.shape[0] / (0.75 * _DRAWN_PX)
+def _written(picture: np.ndarray, words: str, at: tuple[int, int], unit: float) -> np.ndarray:
+    """The picture with words, white in a dark halo, in place; `unit` enlarges them."""
     for colour, width in ((_HALO, 3), (_INK, 1)):
         cv2.putText(picture, words, at, _FONT, _FONT_SCALE * unit, colour, round(width * unit), cv2.LINE_AA)
     return picture

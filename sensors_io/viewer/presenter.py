@@ -94,8 +94,8 @@ class Channel:
         listed = {
             "rate": f"{self.rate_hz:.1f} Hz",
             "samples": str(counts.arrived),
-            "lost": f"{counts.lost} ({counts.missing} never came)",
-            "twice": str(counts.duplicates),
+            "lost": f"{counts.lost} ({counts.missing} not received)",
+            "repeated": str(counts.duplicates),
             "disconnects": str(counts.disconnects),
         }
         if self.sample is not None:

@@ -69,7 +69,7 @@ ACTIVE_RULES: tuple[AlarmRule, ...] = (
         meaning="the policy starts with one kind of touch for all questions: enumerate the answers' rewards, or add an "
         "entropy bonus",
         bound=0.1,
-        reason="one question in ten with a kind of its own tells more, and 640 first touches at random tell .02",
+        reason="one question in ten with its own kind of touch gives more; 640 random first touches give .02",
         check=question_of_first_kind,
         below=True,
     ),

@@ -2,7 +2,7 @@
 
 A function gets the mean metrics of the last `WINDOW` steps and of the first `START`, those of the policy that training
 starts from, and returns the number that is compared with a bound, or `None`.
-The codes F1 … F15 number the failures; F11, the collapse of latent prediction, and F14, the prior of the labels, belong
+The codes F1 … F16 number the failures; F11, the collapse of latent prediction, and F14, the prior of the labels, belong
 to other stages.
 """
 
@@ -198,12 +198,12 @@ RULES: tuple[AlarmRule, ...] = (
         code="F1",
         meaning="answers drift to the middle level",
         bound=0.25,
-        reason="a policy 60 % right whose errors are all one level inwards says 'middle' .27 too often at most",
+        reason="if 60 % are right and all errors are one level inwards, the middle level is .27 too frequent at most",
         check=middle_excess,
     ),
     AlarmRule(
         code="F2",
-        meaning="slots echo each other instead of reporting",
+        meaning="slots copy each other instead of reporting their sensor",
         bound=0.1,
         reason="two standard errors of a window above what honest slots reach, 0; a constant echo reaches .67",
         check=echo_excess,
@@ -217,7 +217,7 @@ RULES: tuple[AlarmRule, ...] = (
     ),
     AlarmRule(
         code="F4",
-        meaning="noise is detected, but another object's touch passes",
+        meaning="answers get worse with noise, but not with the touch of another object",
         bound=0.25,
         reason="a policy that reads touch loses as much by another object's touch, up to chance agreement of ⅓",
         check=swap_blindness,
@@ -231,21 +231,21 @@ RULES: tuple[AlarmRule, ...] = (
     ),
     AlarmRule(
         code="F6",
-        meaning="tactile credit without a tactile lead",
+        meaning="R_tu pays, although answers are no better with touch than without",
         bound=0.17,
         reason="the false-credit rate that R_tu is designed for, .12, and two standard errors of a window's 160 groups",
         check=unearned_credit,
     ),
     AlarmRule(
         code="F7",
-        meaning="most groups teach nothing",
+        meaning="most groups give no gradient, because their rewards are equal",
         bound=0.5,
-        reason="half of the rollouts that could teach something are then spent for nothing",
+        reason="half of the rollouts of questions that are not solved yet then give no gradient",
         check=idle_groups,
     ),
     AlarmRule(
         code="F8",
-        meaning="single tokens dominate the update by their reference KL",
+        meaning="the KL of a few tokens from the reference dominates the update",
         bound=1.0,
         reason="one token then costs more than a standard deviation of the reward is worth",
         check=heavy_tail,
@@ -260,7 +260,7 @@ RULES: tuple[AlarmRule, ...] = (
     ),
     AlarmRule(
         code="F9",
-        meaning="entropy blows up",
+        meaning="entropy grows without bound",
         bound=0.2,
         reason="on every token of an answer of 15: three nats, so twenty times as many answers in play as at first",
         check=entropy_growth,
@@ -284,28 +284,28 @@ RULES: tuple[AlarmRule, ...] = (
     ),
     AlarmRule(
         code="F12",
-        meaning="time ids stand still, so that a shuffle tests nothing",
+        meaning="all frames have the same time index, so that shuffled frames test nothing",
         bound=0.01,
         reason="recorded frames have different indices; only a cast or a unit error makes them equal",
         check=frozen_time,
     ),
     AlarmRule(
         code="F13",
-        meaning="answers name levels where they cannot be read",
+        meaning="answers name levels but cannot be parsed",
         bound=0.2,
         reason="a supervised policy writes one such answer in twenty; four times as many are a strategy",
         check=gamed_answers,
     ),
     AlarmRule(
         code="F15",
-        meaning="groups are left out, for a reward is not finite",
+        meaning="groups are skipped, because a reward is not finite",
         bound=RARE,
-        reason="more than three groups in a window of 160 are no accident of one batch",
+        reason="one bad batch does not explain more than three groups in a window of 160",
         check=left_out_groups,
     ),
     AlarmRule(
         code="F15",
-        meaning="updates are left out, for their gradient is not finite",
+        meaning="updates are skipped, because their gradient is not finite",
         bound=0.1,
         reason="one update in ten is lost; a single one may be a rare overflow",
         check=left_out_updates,
@@ -313,7 +313,7 @@ RULES: tuple[AlarmRule, ...] = (
     ),
     AlarmRule(
         code="F16",
-        meaning="the sampler is not the learner's policy",
+        meaning="the sampler is not the learner's policy: their log-probabilities differ",
         bound=0.1,
         reason="ten times what bfloat16 rounds a token off; beyond it weights, positions or a temperature differ",
         check=sampler_mismatch,

@@ -77,7 +77,7 @@ def run(config: ReinforcingConfig, context: Context) -> Results:
     state = begin(decoder, jax.random.key(0))
     judge = jax.jit(lambda params: certainty(policy, params, held))
     run_loop(
-        lambda s, batch: step(s, batch, frozen),
+        lambda s, batch: step(s, batch, frozen, fns.base),
         state,
         feed,
         config.loop(),

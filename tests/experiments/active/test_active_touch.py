@@ -95,5 +95,4 @@ def test_a_warm_start_that_cannot_read_touch_concludes_nothing_about_choosing():
 
     assert len(said(0.5)) == 3
     (only,) = said(-0.5)
-    assert "does not answer how to choose" in only
     assert "+0.5" in only

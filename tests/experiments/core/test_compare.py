@@ -27,8 +27,8 @@ def test_seeds_are_paired():
     a = {"arms": {"x": {"acc": estimate(10, 20, 30), "omae": estimate(1, 2), "csc": estimate(5, 6)}}, "baselines": {}}
     b = {"arms": {"x": {"acc": estimate(11, 21, 31.3), "omae": estimate(0, 3), "csc": estimate(5, 6)}}, "baselines": {}}
     assert figures(a, b) == {
-        "x acc": ("+1.1 [0.67, 1.53]", "0 lies outside"),
-        "x omae": ("+0 [−12.7, 12.7]", "may be chance"),
+        "x acc": ("+1.1 [0.67, 1.53]", "significant"),
+        "x omae": ("+0 [−12.7, 12.7]", "not significant"),
         "x csc": ("", "same"),
     }
 
@@ -65,7 +65,7 @@ def test_of_several_runs_shared_figures_are_judged_against_the_first():
     runs = [{"arms": {"x": {"acc": estimate(*seeds)}}} for seeds in ((1, 2), (1, 2), (3, 4.1))]
     runs[1]["arms"]["x"]["csc"] = estimate(1)
     found = {f.where: f for f in compare_results(*runs)}
-    assert (found["x acc"].change, found["x acc"].verdict) == ("C", "0 lies outside")
+    assert (found["x acc"].change, found["x acc"].verdict) == ("C", "significant")
     assert len(found["x acc"].shown) == 3
     assert found["x csc"].verdict == "only in B"
     assert found["x csc"].shown[::2] == ("–", "–")

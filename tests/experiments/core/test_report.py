@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from experiments.core.artifacts import write_text
-from experiments.core.report import is_best, pieces, write_report
+from experiments.core.report import is_best, pieces, word_columns, write_report
 from experiments.core.results import Comparison, Estimate, Picture, Results, Trace, named_table
-from experiments.core.text import MEANINGLESS, SMOKE
+from experiments.core.text import MEANINGLESS, SMOKE, bounds, number
 from tests.experiments.core.test_results import FAST, SLOW
 from tests.experiments.fakes import coin
 from touchr1_jax.bench.metrics import METRICS
@@ -171,6 +171,24 @@ def test_a_run_without_curves_rollouts_or_middle_rate_has_no_such_sections(tmp_p
     bare = Results(arms=arms, baselines={}, settings={"preset": "paper", "lr_scale": 1.0})
     text = read(write_report(tmp_path, bare, about="Why?", description=DESCRIPTION).read_text()).text
     assert not any(section in text for section in ("Training curves", "rollouts", "middle"))
+
+
+def test_figures_with_intervals_are_figures_and_a_missing_one_is_no_word():
+    rows = [{"arm": "a", "gain": "+1.0 [−0.2, 2.1]", "p": 0.1, "why": None}, {"arm": "b", "gain": "–", "why": "noise"}]
+    assert word_columns(named_table("", rows)) == [True, False, False, True]
+
+
+def test_pairs_of_a_metric_are_together_and_a_column_without_figures_is_left_out(tmp_path, results):
+    mixed = [compared(metric, arm, "unpaid", 1, 2) for arm in ("paid", "blind") for metric in ("acc", "omae")]
+    page = write(tmp_path, dataclasses.replace(results, comparisons=tuple(mixed), data={"nested": {"a": 1}, "n": 2}))
+    assert page.count('<tr class="first">') == 2
+    assert "<th>95 % over objects</th>" not in page
+    assert "nested" not in page
+
+
+def test_the_sign_of_zero_shows_in_an_interval_alone():
+    assert [number(x, spec) for x, spec in ((-0.04, "+.1f"), (-0.04, ".1f"), (-0.06, ".1f"))] == ["+0.0", "0.0", "−0.1"]
+    assert bounds(-0.04, 0.04, "+.1f") == "[−0.0, +0.0]"
 
 
 def test_a_text_is_cut_at_its_segments():

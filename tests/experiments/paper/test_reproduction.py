@@ -20,8 +20,8 @@ def run(values):
         (ABOVE, "higher", "holds"),
         (BELOW, "higher", "does not hold"),
         (BELOW, "lower", "holds"),
-        (AROUND, "higher", "cannot be told"),
-        ([1.0], "higher", "cannot be told"),
+        (AROUND, "higher", "undecided"),
+        ([1.0], "higher", "undecided"),
     ],
 )
 def test_a_verdict_follows_from_the_interval(values, better, verdict):
@@ -40,4 +40,4 @@ def test_an_interval_is_read_from_a_note_or_a_cell():
 def test_the_page_is_that_of_the_recorded_runs(tmp_path):
     written = (ROOT / PAGE).read_text(encoding="utf-8")
     assert written == markdown(outcomes()), "run: python -m experiments.paper.reproduction"
-    assert {o.verdict for o in outcomes(tmp_path)[: len(CLAIMS)]} == {"cannot be told"}  # nothing is recorded there
+    assert {o.verdict for o in outcomes(tmp_path)[: len(CLAIMS)]} == {"undecided"}  # nothing is recorded there

@@ -55,7 +55,7 @@ def test_two_sensors_and_a_force_on_one_page(live):
     assert said["captions"]["tac3d: depth"].startswith("indentation")
     assert said["title"] == "gelsight_mini 7 + tac3d 7"
     assert said["force_n"] == [3.0, 4.0, -2.0]
-    assert said["tables"]["gelsight_mini"]["lost"] == "3 (3 never came)"
+    assert said["tables"]["gelsight_mini"]["lost"] == "3 (3 not received)"
     assert said["tables"]["tac3d"]["flags"] == "saturated, time gap"
     assert said["tables"]["force"] == {"normal": "2.00 N", "tangential": "5.00 N", "lost": "0"}
 

@@ -87,7 +87,9 @@ def test_a_picture_of_known_width_has_a_scale_and_a_field_its_colours():
     dark = np.zeros((80, 106, 3), np.uint8)
     assert with_rule(dark, None) is dark
     for shape in ((240, 320), (400, 300)):
-        bar = with_bar(coloured(np.zeros(shape), 1.5), 1.5)[:, shape[1] + round(10 * shape[1] / 320)]
+        drawn = with_bar(coloured(np.zeros(shape), 1.5), 1.5)
+        assert len(np.unique(drawn[:, -1], axis=0)) == 1  # no letter is cut off at the edge
+        bar = drawn[:, shape[1] + round(10 * shape[1] / 320)]
         assert bar[0].tolist() == coloured(np.full((1, 1), 2.0), 1.5)[0, 0].tolist()
         assert bar[-1].tolist() == coloured(np.zeros((1, 1)), 1.5)[0, 0].tolist()
     frame = np.full((60, 80, 3), 90, np.uint8)

@@ -178,4 +178,4 @@ def test_a_bonus_that_hardly_any_group_earns_is_not_judged():
 def test_an_alarm_says_what_fired():
     failing = HEALTHY | {"drawn_degenerate_share": 0.9, "drawn_accuracy": 0.65}
     (alarm,) = (a for a in [RULES[6].alarm(failing, HEALTHY)] if a)
-    assert str(alarm) == "alarm F7: most groups teach nothing (0.8, bound 0.5)"
+    assert str(alarm) == f"alarm F7: {alarm.meaning} (0.8, bound 0.5)"
