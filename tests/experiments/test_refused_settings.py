@@ -25,11 +25,9 @@ PRESSES_BY_ONE_SENSOR = {"motions": ("press",), "forces_n": (2.0,), "sensors": (
         *((f"{ACTIVE}.ActiveTouchConfig", {field: 0}, "full_seeds") for field in ("seeds", "full_seeds", "contacts")),
         *(
             (f"{ACTIVE}.ActiveTouchConfig", {field: price}, field)
-            for field in ("second_price", "harm_price")
-            for price in (float("nan"), float("inf"), -0.1)
+            for bad in (float("nan"), float("inf"), -0.1)
+            for field, price in (("second_price", bad), ("harm_price", bad), ("second_prices", (0.01, bad)))
         ),
-        (f"{ACTIVE}.ActiveTouchConfig", {"second_prices": (0.01, float("nan"))}, "second_prices"),
-        (f"{ACTIVE}.ActiveTouchConfig", {"second_prices": (0.01, -0.1)}, "second_prices"),
         ("active.contacts.ContactsConfig", {"motions": ("push",)}, "motions"),
         ("active.contacts.ContactsConfig", {"sensors": ()}, "sensors"),
         ("active.contacts.ContactsConfig", {"forces_n": (2.0, 2.0)}, "forces_n"),

@@ -97,7 +97,8 @@ def first_logits(policy, params, batch):
     @jax.jit
     def logits(params, batch):
         features = jax.tree.map(lambda x: x[0], policy.fns.encode(params, batch))
-        return policy.fns.prefill(params, features, policy.layout.ids[0], policy.layout.mask[0])[0]
+        ids, mask = jnp.asarray(policy.layout.ids[0]), jnp.asarray(policy.layout.mask[0])
+        return policy.fns.prefill(params, features, ids, mask)[0]
 
     return np.asarray(logits(params, batch))
 
