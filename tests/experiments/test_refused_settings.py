@@ -15,10 +15,26 @@ from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import ModelConfig
 from touchr1_jax.training.rollout_server import RolloutsConfig
 
+ACTIVE = "active.active_touch"
+PRESSES_BY_ONE_SENSOR = {"motions": ("press",), "forces_n": (2.0,), "sensors": ("tac3d",)}
+
 
 @pytest.mark.parametrize(
     ("where", "changes", "message"),
     [
+        *((f"{ACTIVE}.ActiveTouchConfig", {field: 0}, "full_seeds") for field in ("seeds", "full_seeds", "contacts")),
+        *(
+            (f"{ACTIVE}.ActiveTouchConfig", {field: price}, field)
+            for bad in (float("nan"), float("inf"), -0.1)
+            for field, price in (("second_price", bad), ("harm_price", bad), ("second_prices", (0.01, bad)))
+        ),
+        ("active.contacts.ContactsConfig", {"motions": ("push",)}, "motions"),
+        ("active.contacts.ContactsConfig", {"sensors": ()}, "sensors"),
+        ("active.contacts.ContactsConfig", {"forces_n": (2.0, 2.0)}, "forces_n"),
+        ("active.contacts.ContactsConfig", {"forces_n": (0.0,)}, "forces_n"),
+        ("active.contacts.ContactsConfig", {"picture_px": 25}, "picture_px"),
+        ("active.contacts.ContactsConfig", PRESSES_BY_ONE_SENSOR, "nothing to choose"),
+        *(("active.videos.StoppingConfig", {field: 1}, field) for field in ("videos", "folds", "warm_share")),
         ("bench.paper_audit.PaperAuditConfig", {"vtv_items": 0}, "vtv_items is 0"),
         ("encoder.stage_one.StageOneConfig", {"labelled": (30, 10)}, "labelled"),
         ("encoder.stage_one.StageOneConfig", {"labelled": ()}, "labelled"),
@@ -37,6 +53,8 @@ from touchr1_jax.training.rollout_server import RolloutsConfig
         ("engine.throughput_feed.FeedingConfig", {"cores": 0}, "cores is 0"),
         ("engine.throughput_feed.FeedingConfig", {"batches": 0}, "batches is 0"),
         ("engine.throughput_feed.FeedingConfig", {"steps": 1}, "steps is 1: must be at least 2"),
+        ("faults.kills.KillConfig", {"kills": 0}, "needs kills"),
+        ("faults.kills.KillConfig", {"startup_share": 1.0}, "needs kills"),
         ("fields.stability_fields.FieldStabilityConfig", {"methods": ("mean shift",)}, "must hold"),
         ("mechanics.identifiability.DEFAULT", {"noise": (0.0, 2.0)}, "noise is"),
         (

@@ -1,5 +1,7 @@
 """Generated scenes become records once, and an interrupted generation goes on."""
 
+import json
+import os
 import signal
 import subprocess
 import sys
@@ -44,7 +46,7 @@ def test_all_contacts_are_written_once(tmp_path, asked):
 
 
 _CHILD = """
-import dataclasses, os, pathlib, signal, sys, types
+import dataclasses, json, os, pathlib, signal, sys, types
 from tests.sensors_io import fakes
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +64,6 @@ for module in (cards, config, protocol):  # without JAX, which takes seconds to 
     sys.modules[module.__name__] = module
 from sensors_io import generate, index, shards
 
-out, place, count = pathlib.Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])
 seen = 0
 
 def die(at):
@@ -84,24 +85,40 @@ killing(shards.ShardWriter, "write", "before write", "after write")
 killing(shards.ShardWriter, "publish", "before publish", "after publish")
 killing(index.Index, "write", "before index", "after index")
 killing(os, "fsync", "before sync", "after sync")
-generate.generate_records(SceneConfig(), out, records_per_shard=64)
+for line in sys.stdin:
+    child = os.fork()
+    if not child:
+        out, place, count = json.loads(line)
+        generate.generate_records(SceneConfig(), pathlib.Path(out), records_per_shard=64)
+        os._exit(0)
+    print(os.waitpid(child, 0)[1], flush=True)
 """
+"""Generates in one fork after the other, each killed at a place that it is told."""
 
 
-def _generate(out, place="nowhere", count=1):
-    command = [sys.executable, "-c", _CHILD, str(out), place, str(count)]
-    return subprocess.run(command, check=False, timeout=120).returncode
+@pytest.fixture
+def generated():
+    """How a generation into a folder ends that is killed when it comes to a place for the nth time."""
+    command = [sys.executable, "-c", _CHILD]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+
+        def ends(out, place="nowhere", count=1):
+            print(json.dumps([str(out), place, count]), file=process.stdin, flush=True)
+            return os.waitstatus_to_exitcode(int(process.stdout.readline()))
+
+        yield ends
+        process.stdin.close()
 
 
-def test_kill_9_at_five_places_changes_no_byte(tmp_path):
+def test_kill_9_at_five_places_changes_no_byte(tmp_path, generated):
     """Inside a shard, before and after it is published, inside the index, after it: the files come out the same."""
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    assert _generate(whole) == 0
+    assert generated(whole) == 0
     places = [("after write", 10), ("before publish", 2), ("after publish", 2), ("before sync", 4), ("after index", 1)]
     for place, count in places:
-        assert _generate(killed, place, count) == -signal.SIGKILL, place
+        assert generated(killed, place, count) == -signal.SIGKILL, place
         assert not (killed / "index.json").exists() or not RecordStore(killed, allow_incomplete=True).complete
-    assert _generate(killed) == 0
+    assert generated(killed) == 0
     assert RecordStore(killed).contacts == RecordStore(whole).contacts
     for i in range(len(RecordStore(whole))):
         for sensor, sequence in RecordStore(whole).contact(i).items():

@@ -196,8 +196,7 @@ class TestClipBatches:
         assert not any((clip == other).all() for clip in first for other in later)  # another change each time
         same(plain[0], frames(augment=AugmentConfig())[0])
 
-    @pytest.mark.parametrize("stop", [0, 1, 2, 3, 7])
-    @pytest.mark.parametrize("augment", [None, LIVELY], ids=["plain", "changed"])
+    @pytest.mark.parametrize(("stop", "augment"), [(2, None), (0, LIVELY), (2, LIVELY), (7, LIVELY)])
     def test_resumed_equals_uninterrupted(self, store, stop, augment):
         want = list(itertools.islice(self.batches(store, augment=augment), 9))
         second = iter(self.batches(store, augment=augment))
@@ -212,7 +211,10 @@ class TestClipBatches:
         some = clip_batches(store, [5, 1], SMALL, batch_size=2, seed=0, **once)
         assert [b["contact"].tolist() for b in some] == [[5, 1]]
 
-    def test_worker_processes_change_nothing_but_speed_and_resume_exactly(self, store):
+    def test_worker_processes_change_nothing_but_speed_and_resume_exactly(self, store, tmp_path, monkeypatch):
+        """They need no JAX, which takes seconds to import."""
+        (tmp_path / "jax.py").write_text("raise ImportError")
+        monkeypatch.syspath_prepend(tmp_path)
         want = list(itertools.islice(self.batches(store, augment=LIVELY), 4))
         feeds = first, second = [iter(self.batches(store, workers=2, augment=LIVELY)) for _ in range(2)]
         try:

@@ -15,7 +15,6 @@ from sensors_io.units import Launcher, LauncherError, UnitsError, WorkUnit, chec
 from tests.sensors_io.checks import refused
 
 ENGINES = {
-    "here": Launcher(),
     "processes": Launcher(workers=2),
     "ray": Launcher(engine="ray", workers=2),
     "submitit": Launcher(engine="slurm", workers=2, partition="local"),
@@ -48,10 +47,6 @@ def attempts(folder: pathlib.Path) -> dict[str, int]:
     return {path.stem: len(path.read_text().split()) for path in sorted(folder.glob("*.attempts"))}
 
 
-WORKERS = pytest.mark.parametrize("launcher", [name for name in ENGINES if name != "here"], indirect=True)
-"""In the driver's own process a killed unit kills the driver, and an error is raised as it is."""
-
-
 @pytest.fixture(params=ENGINES)
 def launcher(request, tmp_path, monkeypatch):
     if request.param in NEEDS:
@@ -66,35 +61,27 @@ def folder(tmp_path):
     return tmp_path / "made"
 
 
-@pytest.mark.filterwarnings("ignore")
-def test_every_unit_is_run_once_and_none_that_is_done(launcher, folder):
+def test_every_unit_is_run_once_and_none_that_is_done(folder):
     (folder / "u2").write_text("made before")
     said = []
-    assert {unit.name for unit in finish(listed(folder), launcher, said.append)} == {f"u{i}" for i in range(6)}
+    assert {unit.name for unit in finish(listed(folder), Launcher(), said.append)} == {f"u{i}" for i in range(6)}
     assert attempts(folder) == {f"u{i}": 1 for i in (0, 1, 3, 4, 5)}
     assert (folder / "u2").read_text() == "made before"
     assert said == []
 
 
-@WORKERS
 @pytest.mark.filterwarnings("ignore")
-def test_a_killed_worker_costs_its_unit_one_more_run(launcher, folder):
-    said = []
-    ended = list(finish(listed(folder, u1="SIGKILL", u4="SIGKILL"), launcher, said.append))
-    assert sorted(unit.name for unit in ended) == [f"u{i}" for i in range(6)]
-    assert attempts(folder) == {f"u{i}": 1 + (i in (1, 4)) for i in range(6)}
-    assert len(said) == 2
-    assert all("its worker died" in line for line in said)
-
-
-@WORKERS
-@pytest.mark.filterwarnings("ignore")
-def test_a_worker_that_is_preempted_costs_its_unit_one_more_run_at_most(launcher, folder):
-    """submitit goes on after SIGTERM, since Slurm sends it beside the signal that submitit waits for."""
-    said, goes_on = [], launcher.engine == "slurm"
-    assert len(list(finish(listed(folder, 3, u1="SIGTERM"), launcher, said.append))) == 3
-    assert attempts(folder) == {"u0": 1, "u1": 1 if goes_on else 2, "u2": 1}
-    assert [line.partition(":")[0] for line in said] == ([] if goes_on else ["u1"])
+def test_a_worker_that_dies_costs_its_unit_one_more_run_and_a_unit_that_fails_no_other(launcher, folder):
+    """None that is done is run.  submitit goes on after SIGTERM, which Slurm sends beside the signal it waits for."""
+    (folder / "u2").write_text("made before")
+    said, ended, goes_on = [], [], launcher.engine == "slurm"
+    work = listed(folder, u1="SIGKILL", u3="raise", u4="SIGTERM")
+    with pytest.raises(UnitsError, match=r"^1 of 5 units failed, the first u3: .*u3 cannot be made"):
+        ended.extend(unit.name for unit in finish(work, launcher, said.append))
+    assert sorted(ended) == ["u0", "u1", "u2", "u4", "u5"] == sorted(path.name for path in folder.glob("u?"))
+    assert attempts(folder) == {"u0": 1, "u1": 2, "u3": 1, "u4": 1 if goes_on else 2, "u5": 1}
+    assert (folder / "u2").read_text() == "made before"
+    assert sorted(line.partition(": its worker died")[0] for line in said) == ["u1"] + ["u4"] * (not goes_on)
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGKILL"])
@@ -120,16 +107,6 @@ def alive(pid: int) -> bool:
         return "\nState:\tZ" not in pathlib.Path(f"/proc/{pid}/status").read_text()
     except FileNotFoundError:
         return False
-
-
-@WORKERS
-@pytest.mark.filterwarnings("ignore")
-def test_a_unit_that_fails_is_named_after_the_others_are_done(launcher, folder):
-    work = listed(folder, u1="raise")
-    with pytest.raises(UnitsError, match=r"^1 of 6 units failed, the first u1: .*u1 cannot be made"):
-        list(finish(work, launcher))
-    assert {path.name for path in folder.glob("u?")} == {"u0", "u2", "u3", "u4", "u5"}
-    assert attempts(folder)["u1"] == 1
 
 
 def test_a_worker_that_dies_each_time_ends(folder, monkeypatch):

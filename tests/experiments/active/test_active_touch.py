@@ -10,7 +10,6 @@ from experiments.active import active_touch, stability_touch
 from experiments.active.active_touch import ActiveTouchConfig
 from experiments.active.findings import METRIC, verdict
 from experiments.core.artifacts import read_json
-from experiments.core.errors import ConfigurationError
 from tests.experiments.shrunk import run_shrunk
 
 TINY = dataclasses.replace(
@@ -56,21 +55,6 @@ def test_a_shrunken_run_of_seeds_tells_their_first_motions(tmp_path):
     directory = run_shrunk(stability_touch, config, tmp_path, "--cache-dir", str(tmp_path / "cache"))
     (table,) = read_json(directory / "results.json")["tables"]
     assert [row[0] for row in table["rows"]] == ["0"]
-
-
-@pytest.mark.parametrize("field", ["seeds", "full_seeds", "contacts"])
-def test_too_few_seeds_or_contacts_are_refused(field):
-    with pytest.raises(ConfigurationError, match="full_seeds"):
-        ActiveTouchConfig(**{field: 0})
-
-
-@pytest.mark.parametrize("price", [float("nan"), float("inf"), -0.1])
-@pytest.mark.parametrize("field", ["second_price", "harm_price"])
-def test_prices_that_no_reward_can_have_are_refused_before_contacts_are_made(field, price):
-    with pytest.raises(ConfigurationError, match=field):
-        ActiveTouchConfig(**{field: price})
-    with pytest.raises(ConfigurationError, match="second_prices"):
-        ActiveTouchConfig(second_prices=(0.01, price))
 
 
 def test_a_seed_trains_the_priced_arms_only_where_it_is_asked_for():

@@ -11,7 +11,6 @@ import pytest
 from experiments.active import active_touch
 from experiments.active.active_touch import ActiveTouchConfig
 from experiments.active.arms import Arm, check_arms
-from experiments.active.contacts import ContactsConfig
 from experiments.core.errors import ConfigurationError
 from tests.touchr1_jax.explored import BANK, POLICY
 from touchr1_jax.rewards import RewardError
@@ -51,11 +50,6 @@ def test_arms_that_cannot_learn_are_named(names):
     changes, arm, error = CASES[names]
     with pytest.raises(error, match=names):
         check_arms(world(**changes), POLICY, {"chosen": arm})
-
-
-def test_contacts_without_a_choice_are_refused_before_they_are_made():
-    with pytest.raises(ConfigurationError, match="nothing to choose"):
-        ContactsConfig(motions=("press",), forces_n=(2.0,), sensors=("tac3d",))
 
 
 def test_agents_that_are_not_installed_are_refused_before_contacts_are_made(monkeypatch):

@@ -21,7 +21,6 @@ from experiments.active.plans import (
     until_sure,
 )
 from experiments.active.report import found_motion, motion_accuracy
-from experiments.core.errors import ConfigurationError
 from touchr1_jax.rl.environment import TouchBank, TouchChoice
 
 CHOICES = [TouchChoice(sensor="tac3d", motion=m, force_n=2.0) for m in ("press", "slide_x", "hold")]
@@ -106,12 +105,3 @@ def test_a_first_motion_is_judged_by_the_probes_interval():
     assert found_motion(setup, np.array([1, 1, 0]), beliefs(), 0)
     assert not found_motion(setup, np.array([1, 0, 0]), beliefs(), 0)
     assert not found_motion(setup, np.array([NO_CHOICE]), beliefs(), 0)
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [("motions", ("push",)), ("sensors", ()), ("forces_n", (2.0, 2.0)), ("forces_n", (0.0,)), ("picture_px", 25)],
-)
-def test_contacts_that_cannot_be_made_are_refused(field, value):
-    with pytest.raises(ConfigurationError, match=field):
-        ContactsConfig(**{field: value})

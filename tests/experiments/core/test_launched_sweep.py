@@ -22,9 +22,11 @@ def results(folder: str) -> dict[str, str]:
 
 
 def test_workers_make_the_same_results(tmp_path, monkeypatch, capfd):
+    """One unit is there already, so that a single worker is started, which takes seconds."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).resolve().parents[3]))
     assert sweep((*SWEEP, "--into", "here"), package=FAKES) == 0
+    assert sweep(("coin", "--vary", "toss.bias=0.1", *SWEEP[3:], "--into", "there"), package=FAKES) == 0
     assert sweep((*SWEEP, "--into", "there", "--launcher.workers", "2"), package=FAKES) == 0
     assert "2 of 2 finished" in capfd.readouterr().out
     assert results("there") == results("here")

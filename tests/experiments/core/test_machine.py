@@ -163,14 +163,3 @@ def test_an_experiment_in_two_processes_gives_the_figures_of_one(tmp_path, name)
     one, both = (json.loads((folder / "results.json").read_text()) for folder in latest)
     assert (one["arms"], one["baselines"]) == (both["arms"], both["baselines"])
     assert len(list((tmp_path / "two" / name).iterdir())) == 2  # one run, and `latest`
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["main_table", "ablation_leave_one_out"])
-def test_other_studies_in_two_processes_give_the_results_of_one(tmp_path, name):
-    """Probes on the encoder, and evaluation variants that train."""
-    finish(start(tmp_path / "one", name))
-    two(tmp_path / "two", name)
-    found = [json.loads((tmp_path / run / name / "latest/results.json").read_text()) for run in ("one", "two")]
-    assert found[0]["arms"] == found[1]["arms"]
-    assert found[0]["baselines"] == found[1]["baselines"]

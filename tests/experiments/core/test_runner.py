@@ -2,11 +2,7 @@
 
 import dataclasses
 import json
-import os
 import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -174,28 +170,17 @@ def test_the_scale_chooses_the_defaults_that_overrides_change(arguments, scale, 
     assert (command.scale, command.config.steps) == (scale, steps)
 
 
-ROOT = Path(__file__).resolve().parents[3]
-
-
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_stops_cleanly_and_prints_how_to_continue(workplace, number, code):
-    program = f"import sys; from experiments.core.runner import main; sys.exit(main(sys.argv[1:], package={FAKES!r}))"
-    process = subprocess.Popen(
-        [sys.executable, "-c", program, "coin", "--step-s", "0.05", "--fresh"],
-        cwd=workplace, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    deadline = time.monotonic() + 60
-    while not list(workplace.glob("runs/coin/*/checkpoints/train/paid/0/state.json")):
-        assert process.poll() is None, "the run ended before it could be stopped"
-        assert time.monotonic() < deadline, "the run did not start"
-        time.sleep(0.02)
-    process.send_signal(number)
-    out, _ = process.communicate(timeout=60)
-    assert process.returncode == code
-    assert "To continue: python -m experiments coin --step-s 0.05" in out
+def test_a_signal_stops_cleanly_and_prints_how_to_continue(workplace, monkeypatch, capsys, number, code):
+    """It comes as soon as the first checkpoint is written."""
+    write = coin.write_json
+    monkeypatch.setattr(coin, "write_json", lambda *file: (write(*file), signal.raise_signal(number)))
+    assert run("coin", "--fresh") == code
+    out = capsys.readouterr().out
+    assert "To continue: python -m experiments coin" in out
     assert "--fresh" not in out.splitlines()[-1]
-    (directory,) = (p for p in workplace.glob("runs/coin/*") if not p.is_symlink())
+    (directory,) = (workplace / path for path in directories())
     lines = (directory / "metrics.jsonl").read_text().splitlines()
-    assert [json.loads(line)["step"] for line in lines] == list(range(len(lines)))
+    assert [json.loads(line)["step"] for line in lines] == list(range(5))
     assert not (directory / "results.json").exists()
     assert not list(directory.rglob(".*.json.*")), "half-written files were left behind"

@@ -4,12 +4,15 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.engine.world import CONCLUDE, LENGTH, PARSER, WORDS, K, World, draw, noise_bank, verified_answers
+from experiments.engine import world as small
+from experiments.engine.world import CONCLUDE, LENGTH, PARSER, WORDS, K, World
 from experiments.engine.world_training import lenient_credit
 
 P = 64
 TIDY = World(sloppy=0.0, noise=0.2)
-parse = jax.jit(jax.vmap(PARSER))
+parse, credit = jax.jit(jax.vmap(PARSER)), jax.jit(jax.vmap(lenient_credit))
+draw = jax.jit(small.draw, static_argnums=2)
+verified_answers, noise_bank = jax.jit(small.verified_answers), jax.jit(small.noise_bank)
 
 
 @pytest.mark.parametrize("asked", [0, 1])
@@ -41,7 +44,6 @@ def test_a_lenient_scorer_pays_for_the_right_word_among_others():
     scene = draw(World(), jax.random.key(0), P)
     loose = verified_answers(World(sloppy=1.0), scene, jax.random.key(1))[0]
     tidy = verified_answers(TIDY, scene, jax.random.key(1))[0]
-    credit = jax.vmap(lenient_credit)
     assert np.asarray(credit(loose, parse(loose), scene.batch.target)).all()
     assert not np.asarray(credit(tidy, parse(tidy), scene.batch.target)).any()
     elsewhere = loose.at[:, -6:].set(CONCLUDE).at[:, 0].set(WORDS[0, 0])  # nothing follows the tag

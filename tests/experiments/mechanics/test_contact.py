@@ -11,6 +11,14 @@ from experiments.mechanics.contact_scenes import displacement_error, exact, fail
 from sensors_io.scenes.sensors import GELSIGHT_MINI
 
 
+@pytest.fixture(scope="module")
+def scene():
+    """A scene, the kernels of its gel, and its exact displacement."""
+    scenes = contact_scenes.sample_scenes(GELSIGHT_MINI, 1, 32, 1)
+    kernels = contact_scenes.gel_kernels(GELSIGHT_MINI, 32)
+    return scenes, kernels, exact(zip(*scenes, strict=True), kernels)
+
+
 @pytest.mark.parametrize(
     ("solve", "least", "most"),
     [
@@ -19,13 +27,11 @@ from sensors_io.scenes.sensors import GELSIGHT_MINI
         *(pytest.param(METHODS[name].solve, 0.01, 1, id=name) for name in ("Winkler", "Winkler + response", "blur")),
     ],
 )
-def test_error_of_each_method(solve, least, most):
-    scenes = contact_scenes.sample_scenes(GELSIGHT_MINI, 1, 32, 1)
-    kernels = contact_scenes.gel_kernels(GELSIGHT_MINI, 32)
+def test_error_of_each_method(scene, solve, least, most):
+    scenes, kernels, true = scene
     gel = jnp.asarray(kernels.gel, jnp.float32)
     total = gel + jnp.asarray(kernels.body, jnp.float32) / scenes.modulus_mpa[0]
     found, _ = jax.jit(solve)(jnp.asarray(scenes.gap_mm[0]), scenes.force_n[0], gel, total, kernels.spacing_mm)
-    true = exact(zip(*scenes, strict=True), kernels)
     assert least < displacement_error(np.asarray(found)[None], true)[0] < most
 
 

@@ -94,9 +94,13 @@ def folder(saved, weights, tmp_path_factory):
 
 
 def first_logits(policy, params, batch):
-    features = jax.tree.map(lambda x: x[0], policy.fns.encode(params, batch))
-    ids, mask = jnp.asarray(policy.layout.ids[0]), jnp.asarray(policy.layout.mask[0])
-    return np.asarray(policy.fns.prefill(params, features, ids, mask)[0])
+    @jax.jit
+    def logits(params, batch):
+        features = jax.tree.map(lambda x: x[0], policy.fns.encode(params, batch))
+        ids, mask = jnp.asarray(policy.layout.ids[0]), jnp.asarray(policy.layout.mask[0])
+        return policy.fns.prefill(params, features, ids, mask)[0]
+
+    return np.asarray(logits(params, batch))
 
 
 def test_a_written_policy_describes_itself(folder, saved):

@@ -84,8 +84,10 @@ def test_the_marginal_is_the_mean_over_traces_of_the_levels_that_may_follow(poli
     marginal = sample_program(policy, 3, constrained=True)(params, batch, jax.random.key(1))[1]
     fns, known, length = policy.fns, policy.level_tokens, policy.model.completion_tokens
     draw = SampleConfig(group=3, length=length, end_ids=fns.end_ids, pad_id=fns.pad_id, constraint=policy.constraint)
-    tokens = np.asarray(sample_group(fns, params, batch, jax.random.key(1), draw).tokens)
-    logits = jax.vmap(fns.group_logits, (None, 0, 0, 0, 0))(params, batch.features, batch.ids, batch.mask, tokens)
+    sample = jax.jit(lambda params, batch: sample_group(fns, params, batch, jax.random.key(1), draw).tokens)
+    tokens = np.asarray(sample(params, batch))
+    score = jax.jit(jax.vmap(fns.group_logits, (None, 0, 0, 0, 0)))
+    logits = score(params, batch.features, batch.ids, batch.mask, tokens)
     for i, a in enumerate(attribute):
         at = (tokens[i] == known.opens).argmax(-1) + 1
         scores = np.asarray(logits)[i, np.arange(3), at][:, known.level[a, : policy.levels[a]]]

@@ -16,12 +16,12 @@ from experiments.core.context import Context
 from experiments.core.runs import ROOT
 from experiments.study.cache import LATER, NEVER, USED, fingerprint, source_digest
 from experiments.study.seed import StudySeed
-from experiments.study.stages import EncodedContacts, StudySFT, make_arm
+from experiments.study.stages import EncodedContacts, make_arm
 from sensors_io.records import RecordStore
 from tests.experiments import tiny
 from touchr1_jax.training.loop import LoopConfig
 
-CONFIG = StudySFT(steps=2, batch_size=4)
+CONFIG = tiny.STUDY.sft  # whose program other tests compile too
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +75,7 @@ def test_a_damaged_file_of_the_cache_is_made_again(sft, first, home):
     assert sft("found again")[0].keys() == params.keys()
 
 
-@pytest.mark.parametrize(("steps", "seed"), [(0, 0), (2, 1)])
+@pytest.mark.parametrize(("steps", "seed"), [(0, 0), (3, 1)])
 def test_another_setting_is_another_checkpoint(sft, first, steps, seed):
     before = sft("second")[1]
     assert len(sft("other", dataclasses.replace(CONFIG, steps=steps), seed)[1] - before) == 1

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Iterator
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,6 +16,8 @@ from sensors_io.schema import MATERIALS, UNKNOWN
 ALL = {**properties.PROPERTIES, **properties.DYNAMIC}
 OLD = (7, 7, 1, 6.169470845, 0.106939634, 0.349118311, 2.499351735, 4.172926426)
 """Material, apparent material, pattern, modulus, rms, height, turn and last phase of the first object ever drawn."""
+
+GAP = jax.jit(surface.gap)
 
 KINDS = ((1, "part"), (2, "graded"))
 SUMS = (698.749806, 758.587112, 921.512811)
@@ -114,7 +117,7 @@ def test_skins_move_rigidly(dx: int, dy: int, seed: int) -> None:
     x = (jnp.arange(n) + 0.5) * spacing - n * spacing / 2
 
     offsets = ((0.0, 0.0), (dx * spacing, dy * spacing))
-    here, there = (np.asarray(surface.gap(skin, _pose(0.4, offset), x)) for offset in offsets)
+    here, there = (np.asarray(GAP(skin, _pose(0.4, offset), x)) for offset in offsets)
     rows, columns = slice(max(0, -dy), n - max(0, dy)), slice(max(0, -dx), n - max(0, dx))
     moved = there[max(0, dy) : n + min(0, dy), max(0, dx) : n + min(0, dx)]
     difference = moved - here[rows, columns]
@@ -133,7 +136,7 @@ def test_roughness_and_relief_show_in_the_gap() -> None:
         skin = surface.make_skin(solid, np.zeros(2), 1.0)
         smooth = skin.replace(wave_amplitudes_mm=jnp.zeros_like(skin.wave_amplitudes_mm))
         bare = smooth.replace(feature_height_mm=jnp.array(0.0))
-        rough, even, flat = (np.asarray(surface.gap(s, _pose(), x)) for s in (skin, smooth, bare))
+        rough, even, flat = (np.asarray(GAP(s, _pose(), x)) for s in (skin, smooth, bare))
         assert (rough - even).std() == pytest.approx(solid.rms_mm, rel=0.35)
         assert np.ptp(flat - even) == pytest.approx(solid.feature_height_mm, rel=0.2)
 
@@ -200,7 +203,7 @@ def test_the_skin_over_a_seam_is_that_of_each_side() -> None:
     site = direction * v.offset_mm
     x = (jnp.arange(96) + 0.5) * 0.25 - 12.0
     parts = (solid, solid.at(-99 * direction), solid.at(99 * direction))
-    both, near, far = (np.asarray(surface.gap(surface.make_skin(s, site, 0.0), _pose(), x)) for s in parts)
+    both, near, far = (np.asarray(GAP(surface.make_skin(s, site, 0.0), _pose(), x)) for s in parts)
     x_n = np.asarray(x)
     along = x_n[None] * np.cos(v.direction_rad) + x_n[:, None] * np.sin(v.direction_rad)
     for side, alone in ((along < -2, near), (along > 2, far)):

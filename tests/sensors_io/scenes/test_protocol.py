@@ -16,7 +16,7 @@ from sensors_io.scenes.sensors import MODELS
 from sensors_io.schema import SENSORS, UNKNOWN, Flag, Sequence
 from tests.sensors_io.checks import refused
 
-SMALL = SceneConfig(objects=60, sites=2, frames=3, image_px=48, contact_grid=40, view_px=32, min_force_n=1.0)
+SMALL = SceneConfig(objects=60, sites=2, frames=3, image_px=24, contact_grid=24, view_px=32, min_force_n=1.0)
 
 
 @pytest.fixture(scope="module")
