@@ -39,7 +39,8 @@ def read_json(path: pathlib.Path) -> Any:
 
 
 def seal(text: str) -> str:
-    """Add the checksum to the text of a JSON object, as its last key."""
+    """Add the checksum to the text of a JSON object, as its last key; bytes that are no UTF-8 become JSON's escapes."""
+    text = text.encode(errors="backslashreplace").decode()
     body = text.removesuffix("}").rstrip()
     comma, space, end = "" if body == "{" else ",", "\n  " if "\n" in text else " ", "\n}" if "\n" in text else "}"
     return f'{body}{comma}{space}"{CHECKSUM}": {zlib.crc32(body.encode())}{end}'

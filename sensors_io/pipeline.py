@@ -7,7 +7,7 @@ import dataclasses
 import threading
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as Seq
-from typing import Any, Protocol
+from typing import Any, Protocol, get_args
 
 import absl.flags
 import cv2
@@ -48,6 +48,9 @@ class ClipConfig:
                 raise SchemaError(f"{name} is {getattr(self, name)}: must be ≥ 1; raise it")
         if not self.sensors or len(set(self.sensors)) != len(self.sensors):
             raise SchemaError(f"sensors is {self.sensors}: at least one, each once; correct the list")
+        for name, known in (("choose", get_args(Chooser)), ("show", get_args(Shown))):
+            if getattr(self, name) not in known:
+                raise SchemaError(f"{name} is {getattr(self, name)!r}: must be one of {', '.join(known)}; correct it")
 
 
 class ClipMemory:

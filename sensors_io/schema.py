@@ -132,8 +132,9 @@ class ContactKey:
     def __post_init__(self) -> None:
         _require_name("object_id", self.object_id)
         _require(self.motion in MOTIONS, "motion", self.motion, f"must be one of {', '.join(MOTIONS)}", "rename it")
-        _require(self.site >= 0, "site", self.site, "must be ≥ 0", "number the contact sites from 0")
-        _require(self.trial >= 0, "trial", self.trial, "must be ≥ 0", "number the trials from 0")
+        for name in ("site", "trial"):
+            number = getattr(self, name)
+            _require(0 <= number < 2**32, name, number, "must lie in 0..2³² − 1", f"number each {name} from 0")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -9,6 +9,7 @@ A saved policy observes beliefs of the readers alone: the probes that were avera
 import dataclasses
 import hashlib
 import json
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,10 +20,11 @@ import numpy as np
 from flax import traverse_util
 from jaxtyping import Float, UInt8
 
-from experiments.active.contacts import PROPERTIES, ContactsConfig
+from experiments.active.contacts import LEVELS, PROPERTIES, ContactsConfig
 from experiments.active.encoder import (
     ContactEncoderConfig,
     ContactReader,
+    SingleContact,
     belief_tokens,
     patch_statistics,
     read_contacts,
@@ -188,7 +190,7 @@ def read_explorer(folder: Path) -> Explorer:
         arrays = {name: read_tensor(entry) for name, entry in read_header(folder / SINGLE).items()}
         named = {name.replace("/", "."): x for name, x in arrays.items() if name.startswith("policy/")}
         tree = traverse_util.unflatten_dict(restacked(named), sep=".")
-        return Explorer(
+        explorer = Explorer(
             policy=policy,
             params=jax.tree.map(jnp.asarray, tree["policy"]),
             contacts=contacts,
@@ -197,10 +199,38 @@ def read_explorer(folder: Path) -> Explorer:
             scale=float(found["scale"]),
             budget=int(found["budget"]),
         )
-    except (DamagedFileError, OSError, ValueError, TypeError, LookupError) as error:
+        _require_fit(explorer)
+        return explorer
+    except (DamagedFileError, OSError, AttributeError, ValueError, TypeError, LookupError) as error:
         if isinstance(error, PolicyError):
             raise
         raise PolicyError(f"policy is {folder}: cannot be read ({error}); copy the folder again") from error
+
+
+def _require_fit(one: Explorer) -> None:
+    """Refuse parameters of other shapes than the sizes need, numbers that are not finite, no contact.
+
+    Raises:
+      ValueError: naming the first misfit.
+    """
+    if not (0 < one.scale < math.inf and one.budget >= 1):
+        raise ValueError(f"scale is {one.scale} and budget {one.budget}: must be finite and above 0, and at least 1")
+    contacts, px = one.contacts, one.contacts.picture_px
+    frames = jax.ShapeDtypeStruct((1, contacts.moments, px + px // 2, px, 3), np.uint8)
+    statistics, choice = jax.eval_shape(patch_statistics, frames), np.zeros(1, np.int32)
+    network = SingleContact(one.encoder, len(contacts.choices))
+    of_choice = jax.ShapeDtypeStruct((len(contacts.choices), statistics.shape[1]), np.float32)
+    network_params = jax.eval_shape(lambda x: network.init(jax.random.key(0), x, choice)["params"], statistics)
+    reader = {"params": network_params, "centre": of_choice, "spread": of_choice}
+    shapes = jax.eval_shape(lambda: one.policy.init(0, len(PROPERTIES) + LEVELS))
+    pairs = [("policy", shapes, one.params)] + [(f"reader {k}", reader, vars(r)) for k, r in enumerate(one.readers)]
+    for name, wanted, given in pairs:
+        want, have = (traverse_util.flatten_dict(dict(tree), sep=".") for tree in (wanted, given))
+        for key in sorted(want.keys() | have.keys()):
+            if key not in want or key not in have or want[key].shape != have[key].shape:
+                raise ValueError(f"{key} of {name} is missing, left over, or of another shape than the sizes need")
+            if not np.isfinite(have[key]).all():
+                raise ValueError(f"{key} of {name} holds numbers that are not finite: its training diverged")
 
 
 def _tuples(fields: Mapping[str, Any]) -> dict[str, Any]:

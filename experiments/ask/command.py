@@ -90,6 +90,8 @@ class AskCommand(Places):
             policy = given.pop(0)  # names neither: the error says what a policy can be
         if len(given) not in (1, 2) or (self.every and len(given) != 1):
             raise DataError(f"names are {self.names}: must be at most one POLICY and one or two INPUTs; correct them")
+        if self.every and (self.question or self.sensor or self.html is not None):
+            raise DataError(f"every is {self.every!r}: goes without --question, --sensor and --html; leave them out")
         found = find_policy(policy, self.runs_dir, self.weights)
         if self.every:
             print_lines(*self._every(found, Path(given[0])))

@@ -70,15 +70,19 @@ def explored(
         raise DataError(f"question is {question!r}: it compares two objects; ask about one")
     contacts = unseen_object(explorer.contacts, source) if source else explorer.contacts
     give = _generated(contacts) if source else _person(contacts, say, listen)
+    unmade: list[int] = []
 
     def contact(choice: int) -> Any:
         say(f"now {request(explorer.contacts.choices[choice])}")
-        return give(choice)
+        frames = give(choice)
+        unmade.extend([choice] if frames is None else ())
+        return frames
 
     with compiled_quickly():  # programs that run a few times
         found = explorer.ask(list(WORDS).index(asked.name), contact)
     truth = WORDS[asked.name][solid_of(contacts.scenes, 0).levels()[asked.name]] if source else ""
-    return exploration_line(explorer, found, question, truth)
+    said = exploration_line(explorer, found, question, truth)
+    return f"{said}; {len(unmade)} of them could not be made" if unmade else said
 
 
 def request(choice: tuple[str, str, float]) -> str:
@@ -117,8 +121,14 @@ def _person(
         sensor = contacts.choices[choice][0]
         while True:
             say("its recording (RECORDS:CONTACT, a video, or a folder of pictures; empty if it cannot be made):")
-            answer = listen().strip()
-            if not answer:
+            try:
+                line = listen()
+            except UnicodeDecodeError:
+                say("that is no text in UTF-8; name the recording again, or rename it")
+                continue
+            if not line:
+                raise DataError("the answers ended before the policy concluded; answer each request, at least by Enter")
+            if not (answer := line.strip()):
                 return None
             try:
                 return recorded_frames(recording(answer, sensor), contacts)

@@ -27,7 +27,7 @@ from sensors_io.pipeline import make_clip
 from sensors_io.records import RecordStore
 from sensors_io.scenes.cards import solid_of
 from sensors_io.scenes.config import SceneConfig
-from sensors_io.schema import ATTRIBUTES, ContactKey, ObjectCard
+from sensors_io.schema import LEVELS, ContactKey, ObjectCard
 from sensors_io.schema import Sequence as TouchSequence
 from touchr1_jax.asking import TouchInput
 from touchr1_jax.models.saved_policy import SavedPolicy, words
@@ -68,6 +68,8 @@ def read_touch(source: str | Path, saved: SavedPolicy, sensor: str = "") -> Aske
       DataError: an input that cannot be read.
     """
     text = str(source)
+    if sensor and sensor not in saved.sensors:
+        raise DataError(f"sensor is {sensor!r}: the policy reads {', '.join(saved.sensors)}; choose one of them")
     if text.partition(":")[0] == GENERATED:
         return _generated(text.partition(":")[2], saved)
     path, _, which = (text, "", "") if Path(text).exists() else text.rpartition(":")
@@ -88,10 +90,10 @@ def read_contacts(store: RecordStore, rows: Sequence[int], saved: SavedPolicy) -
 
 def _generated(which: str, saved: SavedPolicy) -> AskedTouch:
     """A generated object that training never saw, pressed by all sensors as those of training were."""
-    known = {word: (name, level) for name in ATTRIBUTES for level, word in enumerate(words(saved, name))}
-    given = dict(saved.notes.get(SCENES) or {})
-    fields = {field.name for field in dataclasses.fields(SceneConfig)} & given.keys() - {"split_shares"}
+    known = {word: (name, level) for name in _shared(saved) for level, word in enumerate(words(saved, name))}
     try:
+        given = dict(saved.notes.get(SCENES) or {})
+        fields = {field.name for field in dataclasses.fields(SceneConfig)} & given.keys() - {"split_shares"}
         config = SceneConfig(**{name: given[name] for name in fields} | {"objects": 1, "sites": 1, "sequences": None})
     except (TypeError, ValueError) as error:
         raise DataError(
@@ -147,8 +149,6 @@ def _of_contact(store: RecordStore | LiveScenes, i: int, saved: SavedPolicy, nam
 def _filmed(path: Path, saved: SavedPolicy, sensor: str) -> AskedTouch:
     """A video, or a folder of pictures, of one sensor."""
     named = sensor or saved.sensors[0]
-    if named not in saved.sensors:
-        raise DataError(f"sensor is {named!r}: the policy reads {', '.join(saved.sensors)}; choose one of them")
     sequence = filmed_sequence(path, named)
     card = ObjectCard(object_id=sequence.key.object_id, split="unlabelled", labels={}, annotator="")
     asked = _asked({named: sequence}, card, saved, str(path))
@@ -170,6 +170,8 @@ def filmed_sequence(path: Path, sensor: str) -> TouchSequence:
             if not files:
                 raise UnreadableError("holds neither records nor pictures (.jpg, .png)")
             pictures = read_pictures(files, keep.positions(len(files)), keep)
+            if pictures.left_out:
+                raise UnreadableError(f"{pictures.left_out[0].name} {pictures.left_out[0].reason}, remove it")
             index, rate_hz = pictures.index, FILM_RATE_HZ
             arrays = {"frames": pictures.frames, "gap": pictures.after_loss()}
         else:
@@ -194,7 +196,7 @@ def _asked(contact: Mapping[str, TouchSequence], card: ObjectCard, saved: SavedP
     clip = make_clip(contact, card, clip_of(saved))
     real = {sensor: clip.frame_mask[s] for s, sensor in enumerate(saved.sensors) if sensor in sensors}
     of = lambda array: {sensor: array[saved.sensors.index(sensor)][mask] for sensor, mask in real.items()}
-    known = {a: level for a, level in card.labels.items() if level >= 0 and a in saved.questions}
+    known = {a: level for a, level in card.labels.items() if level >= 0 and a in _shared(saved)}
     remarks = []
     force_known = any(contact[sensor].force_n is not None for sensor in sensors)
     if saved.reads.force and not force_known:
@@ -210,3 +212,8 @@ def _asked(contact: Mapping[str, TouchSequence], card: ObjectCard, saved: SavedP
         remarks=tuple(remarks),
         force_known=force_known,
     )
+
+
+def _shared(saved: SavedPolicy) -> list[str]:
+    """Attributes of which the labels of records and a policy have the same levels."""
+    return [name for name, levels in LEVELS.items() if name in saved.questions and len(words(saved, name)) == levels]

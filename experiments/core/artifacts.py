@@ -60,6 +60,8 @@ def jsonable(value: Any, where: str = "value") -> Any:
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Publish a file by way of a flushed temporary sibling; `UnwrittenError` if it does not reach the disk."""
+    if path.exists() and not path.is_file():  # a device would be replaced by a file
+        raise UnwrittenError(f"{path} is a folder or a device: must be a file, or not there; name another path")
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
@@ -77,8 +79,8 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Publish a UTF-8 text atomically."""
-    write_bytes(path, text.encode())
+    """Publish a UTF-8 text atomically; bytes of a file's name that are no UTF-8 are written as escapes."""
+    write_bytes(path, text.encode(errors="backslashreplace"))
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = False) -> None:

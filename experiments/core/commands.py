@@ -239,9 +239,9 @@ def _past_runs(home: Path) -> tuple[list[runs.PastRun], list[str]]:
 
 def print_lines(*texts: str) -> None:
     """Print lines as they are."""
-    Console(soft_wrap=True, highlight=False).print(*texts, sep="\n", markup=False)
+    Console(soft_wrap=True, highlight=False, emoji=False).print(*texts, sep="\n", markup=False)
 
 
 def print_error(text: str) -> None:
     """Print to standard error."""
-    Console(stderr=True, soft_wrap=True, highlight=False).print(text, markup=False)
+    Console(stderr=True, soft_wrap=True, highlight=False, emoji=False).print(text, markup=False)

@@ -8,6 +8,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
+from experiments.core.artifacts import DamagedFileError
 from experiments.core.runs import PastRun, continuing
 from experiments.core.text import ABSENT, aligned, bounds, duration, interval, number
 from touchr1_jax.bench.statistics import student_interval
@@ -99,7 +100,18 @@ def compare_results(*results: Mapping[str, Any], names: Sequence[str] = ascii_up
 
 
 def figures(results: Mapping[str, Any]) -> dict[str, Any]:
-    """Name → estimate, requirement or cell of a table; rows of one name are numbered."""
+    """Name → estimate, requirement or cell of a table; rows of one name are numbered.
+
+    Raises:
+      DamagedFileError: results that are not those of a run.
+    """
+    try:
+        return _figures(results)
+    except (LookupError, TypeError, AttributeError, ValueError) as error:
+        raise DamagedFileError(f"results.json is not that of a run ({error!r}): put a copy back") from error
+
+
+def _figures(results: Mapping[str, Any]) -> dict[str, Any]:
     arms = {**results.get("arms", {}), **results.get("baselines", {})}
     found = {f"{name} {metric}": value for name, row in arms.items() for metric, value in row.items()}
     found |= {f"requirement: {r['name']}": r["measured"] for r in results.get("requirements", ())}
@@ -110,6 +122,8 @@ def figures(results: Mapping[str, Any]) -> dict[str, Any]:
             label = str(name) if again == 1 else f"{name} #{again}"
             for column, cell in zip(table["columns"][1:], cells, strict=True):
                 found[f"{table['title']} | {label} | {column['name']}"] = cell
+    if any(isinstance(x, Mapping) and not {"mean", "ci95", "per_seed"} <= x.keys() for x in found.values()):
+        raise ValueError("an estimate without mean, ci95 or per_seed")
     return found
 
 

@@ -367,7 +367,7 @@ def _compute(
     try:
         events: list[watchers.Watcher] = [watchers.Events(directory / EVENTS)] if command.tensorboard else []
         events += [watchers.WeightsAndBiases(directory, description)] if command.wandb else []
-        context = make_context(Console(), [watchers.Latest(directory), page, *events])
+        context = make_context(Console(emoji=False), [watchers.Latest(directory), page, *events])
         with contextlib.closing(context), context.timed("total"), page.kept_fresh():
             results = experiment.run(command.config, context)
         tables = (*results.tables, *left_out_tables(read_metrics(directory)))

@@ -15,7 +15,7 @@ import os
 import shlex
 import signal
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,26 +23,23 @@ import jax
 import tyro
 
 from experiments.core import runs
-from experiments.core.artifacts import jsonable, write_sealed
-from experiments.core.charts import Panel, Series, draw, estimates
+from experiments.core.artifacts import DamagedFileError, jsonable, read_json, write_sealed
 from experiments.core.commands import PROG, SWEEP, find, print_error, print_lines, unknown_name
 from experiments.core.compare import figures
 from experiments.core.report import write_report
 from experiments.core.results import Cell, Column, Estimate, Picture, Results, Table
 from experiments.core.runner import Experiment, load, parse, run_experiment
+from experiments.core.sweep_figures import chart, chosen_figures, number_of
 from sensors_io.errors import UserError
 from sensors_io.units import HERE, Launcher, LauncherError, UnitsError, WorkUnit, finish
 from touchr1_jax.bench.scoring import REPORTED
 
+LIST = "sweep.json"
+"""Units of a sweep, in its folder."""
+
 FOLDERS = "sweeps"  # folder of the sweeps in the folder of all runs
 
 DIGITS = 8  # of a hash in a name
-MOST = 6  # figures of a table whose figures nobody chose
-
-MAIN = ("acc", "avg", "omae")  # metrics of a table of arms whose figures nobody chose
-
-WIDE = 20.0  # largest over smallest value from which on an axis is logarithmic
-
 NOTE = (
     "Scores are those of test objects.  They say how much a setting matters; a setting that was chosen by them must be "
     "scored on other objects."
@@ -119,7 +116,12 @@ class SweepCommand:
             print_error(f"{type(error).__name__}: {error}")
             return 2
         run = run_sweep if self.launcher.here else functools.partial(launch_sweep, self.launcher, package)
-        return run(experiment, about, folder, units, self.figures)
+        try:
+            require_growth(folder, self.name, units)
+            return run(experiment, about, folder, units, self.figures)
+        except (SweepError, DamagedFileError) as error:
+            print_error(f"{type(error).__name__}: {error}")
+            return 1
 
 
 def main(arguments: Sequence[str], package: str = "experiments") -> int:
@@ -166,10 +168,11 @@ def plan(
       SweepError: as `options_of`; an option that a sweep gives itself, or two units of one configuration.
       SystemExit: code 2 after the correction of an option or a value that the experiment does not know.
     """
-    own = [word for word in rest if word.partition("=")[0] in ("--fresh", "--runs-dir", "--runs_dir")]
+    varied, planned = options_of(vary), dict[str, tuple[dict[str, str], tuple[str, ...], Any]]()
+    words = (*rest, *(f"--{option}" for option in varied))
+    own = [word for word in words if word.partition("=")[0] in ("--fresh", "--runs-dir", "--runs_dir")]
     if own:
         raise SweepError(f"{own[0]} belongs to single runs: leave it out; --into names the folder of a sweep")
-    varied, planned = options_of(vary), dict[str, tuple[dict[str, str], tuple[str, ...], Any]]()
     for values in itertools.product(*varied.values()):
         settings = dict(zip(varied, values, strict=True))
         words = (*rest, *itertools.chain(*(_words(*one) for one in settings.items())))
@@ -271,12 +274,39 @@ def _list_units(experiment: Experiment[Any], about: str, folder: Path, units: Se
     scale: str = parse(experiment, units[0].command, about).scale
     listed = [{"hash": u.digest, "settings": u.settings, "command": u.command, "config": u.config} for u in units]
     folder.mkdir(parents=True, exist_ok=True)
-    write_sealed(folder / "sweep.json", {"experiment": experiment.name, "scale": scale, "units": listed})
+    write_sealed(folder / LIST, {"experiment": experiment.name, "scale": scale, "units": listed})
     return scale
 
 
+def require_growth(folder: Path, name: str, units: Sequence[SweepUnit]) -> None:
+    """Refuse a folder of another sweep, whose list and page this one would overwrite; it may only grow.
+
+    Raises:
+      SweepError: the folder lists units that this sweep lacks.
+      DamagedFileError: its list is damaged.
+    """
+    path = folder / LIST
+    if not path.is_file():
+        return
+    found = read_json(path)
+    try:
+        listed = {one["hash"]: (found["experiment"], _settings(one["settings"])) for one in found["units"]}
+    except (LookupError, TypeError, AttributeError) as error:
+        raise DamagedFileError(f"{path} is not that of a sweep ({error!r}): move it away to write it anew") from error
+    lacking = [told for digest, told in listed.items() if digest not in {unit.digest for unit in units}]
+    if lacking:
+        raise SweepError(
+            f"into is {folder}: its sweep of {lacking[0][0]} has {len(lacking)} runs that this one leaves out, the "
+            f"first of {lacking[0][1]}; give all of its values, or another folder by --into"
+        )
+
+
 def _title_of(unit: SweepUnit) -> str:
-    return ", ".join(f"{name} {value}" for name, value in unit.settings.items())
+    return _settings(unit.settings)
+
+
+def _settings(settings: Mapping[str, str]) -> str:
+    return ", ".join(f"{name} {value}" for name, value in settings.items())
 
 
 def write_page(
@@ -315,77 +345,10 @@ def _table(folder: Path, every: Sequence[tuple[SweepUnit, runs.PastRun | None]],
     rows: list[tuple[Cell, ...]] = []
     for unit, run in every:
         found = {} if run is None or run.results is None else figures(run.results)
-        numbers = [_number(found.get(figure)) for figure in chosen]
+        numbers = [number_of(found.get(figure)) for figure in chosen]
         cells = [one.mean if isinstance(one, Estimate) else one for one in numbers]
         state: tuple[Cell, ...] = ("not begun", None, None)
         if run is not None:
             state = (run.state, run.seconds, str(run.directory.relative_to(folder)))
         rows.append((*unit.settings.values(), *cells, *state))
     return Table(title="Runs", columns=tuple(columns), rows=tuple(rows), note=NOTE)
-
-
-def chosen_figures(results: Sequence[Mapping[str, Any]], wanted: Sequence[str]) -> list[str]:
-    """Names of numbers that all runs have: with a wanted word in them, else the main ones of the arms, or a few."""
-    numbers = [{n for n, x in figures(one).items() if _number(x) is not None} for one in results]
-    shared = [n for n in (figures(results[0]) if results else ()) if all(n in of for of in numbers)]
-    if wanted:
-        return [n for n in shared if any(word in n for word in wanted)]
-    arms = results[0].get("arms", {}) if results else {}
-    main = [f"{arm} {metric}" for metric in MAIN for arm in arms]
-    return [n for n in main if n in shared] or shared[:MOST]
-
-
-def chart(finished: Sequence[tuple[Mapping[str, str], Mapping[str, Any]]], chosen: Sequence[str]) -> bytes:
-    """Draw a panel for each metric, or each chosen figure without one, over the first option.
-
-    A line is an arm, and an arm for each setting of the further options.
-    """
-    first = next(iter(finished[0][0]))
-    listed = list(dict.fromkeys(settings[first] for settings, _ in finished))
-    places = dict(zip(listed, _numbers(listed) or range(len(listed)), strict=True))
-    positive = _numbers(listed) and min(places.values()) > 0
-    scale: Any = "log" if positive and max(places.values()) >= WIDE * min(places.values()) else "linear"
-    panels: dict[str, dict[str, list[tuple[float, Any]]]] = {}
-    for figure in chosen:
-        arm, _, metric = figure.rpartition(" ")
-        title, line = (_title(metric), arm) if metric in REPORTED else (figure, "")
-        for settings, of in finished:
-            others = ", ".join(f"{name} {value}" for name, value in settings.items() if name != first)
-            named = ", ".join(filter(None, (line, others)))
-            panels.setdefault(title, {}).setdefault(named, []).append((places[settings[first]], _number(of[figure])))
-    ticks = {place: value for value, place in places.items()}
-    return draw(
-        [
-            Panel(list(_lines(lines)), title=title, x_label=first, x_scale=scale, x_ticks=ticks)
-            for title, lines in panels.items()
-        ]
-    )
-
-
-def _lines(lines: Mapping[str, Sequence[tuple[float, Any]]]) -> Iterator[Series]:
-    for name, points in lines.items():
-        at, values = zip(*sorted(points, key=lambda point: point[0]), strict=True)
-        if isinstance(values[0], Estimate):
-            yield estimates(name, values, at=at)
-        else:
-            yield Series(name, x=at, y=values)
-
-
-def _number(value: Any) -> Estimate | float | None:
-    """A figure as a number or an estimate; `None` for what is neither."""
-    if isinstance(value, Mapping):
-        return Estimate(**{**value, "ci95": tuple(value["ci95"]), "per_seed": tuple(value["per_seed"])})
-    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
-
-
-def _numbers(words: Sequence[str]) -> list[float]:
-    """Words as numbers, nothing where one is none."""
-    try:
-        return [float(word) for word in words]
-    except ValueError:
-        return []
-
-
-def _title(metric: str) -> str:
-    unit = REPORTED[metric].unit
-    return f"{REPORTED[metric].title} ({unit})" if unit else REPORTED[metric].title

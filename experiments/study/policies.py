@@ -4,9 +4,10 @@ import dataclasses
 import os
 import tempfile
 from pathlib import Path
+from typing import Any
 
 from experiments.core import runs
-from experiments.core.artifacts import jsonable, read_json
+from experiments.core.artifacts import DamagedFileError, jsonable, read_json
 from experiments.core.context import Context
 from experiments.core.text import bounds, number
 from experiments.study.dataset import Dataset
@@ -92,7 +93,15 @@ def measured_figures(name: str, runs_dir: Path) -> dict[str, str]:
     results = None if folder is None else folder.parents[2] / "results.json"
     if folder is None or results is None or not results.exists():
         return {}
-    found, arm = read_json(results), folder.parent.name
+    found = read_json(results)
+    try:
+        return _measured(found, folder.parent.name)
+    except (AttributeError, ValueError, TypeError, LookupError) as error:
+        raise DamagedFileError(f"{results} is not that of a run ({error!r}): put a copy back") from error
+
+
+def _measured(found: Any, arm: str) -> dict[str, str]:
+    """Scores of an arm in the contents of `results.json`."""
     row = found.get("arms", {}).get(arm, {})
     figures = {}
     for metric in FIGURES:

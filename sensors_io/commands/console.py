@@ -18,8 +18,8 @@ PLAIN_EVERY_S = 10.0
 
 
 def _console(*, stderr: bool) -> rich.console.Console:
-    console = rich.console.Console(stderr=stderr)
-    return console if console.is_terminal else rich.console.Console(stderr=stderr, width=WIDTH)
+    console = rich.console.Console(stderr=stderr, emoji=False)
+    return console if console.is_terminal else rich.console.Console(stderr=stderr, emoji=False, width=WIDTH)
 
 
 OUT, ERR = _console(stderr=False), _console(stderr=True)

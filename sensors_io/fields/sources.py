@@ -132,5 +132,5 @@ def _records(path: pathlib.Path, sensor: str) -> Iterator[_Shot]:
 
 def _by_number(path: pathlib.Path) -> tuple[tuple[int, str], ...]:
     """Order in which 2 comes before 10."""
-    parts = "".join(c if c.isdigit() else " " + c + " " for c in str(path)).split()
-    return tuple((int(p), "") if p.isdigit() else (-1, p) for p in parts)
+    parts = "".join(c if c.isdecimal() else " " + c + " " for c in str(path)).split()
+    return tuple((int(p), "") if p.isdecimal() else (-1, p) for p in parts)

@@ -163,9 +163,12 @@ def _stated(file: Any, place: Place, of: ValueMap, name: str) -> Any:
 
 def _whole(value: Any, name: str) -> int:
     try:
-        return int(value)
+        whole = int(value)
     except (TypeError, ValueError, OverflowError) as error:
-        raise HDF5Error(f"{name} is {value!r}: must be a whole number") from error
+        raise HDF5Error(f"{name} is {value!r:.60}: must be a whole number") from error
+    if not isinstance(value, str) and whole != value:
+        raise HDF5Error(f"{name} is {value!r:.60}: must be a whole number")
+    return whole
 
 
 def _level(attribute: str, value: Any) -> int:
@@ -179,4 +182,4 @@ def _plain_name(text: str) -> str:
 
 
 def _by_number(name: str) -> list[tuple[int, int | str]]:
-    return [(0, int(part)) if part.isdigit() else (1, part) for part in re.findall(r"\d+|\D+", name)]
+    return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.findall(r"\d+|\D+", name)]

@@ -216,7 +216,11 @@ def _value(entry: _Entry) -> ValueMap:
 
 def _stream(entry: _Entry) -> StreamMap:
     entry.know(*QUANTITIES, "rate_hz")
-    arrays = {name: _array(entry.part(name), QUANTITIES[name]) for name in QUANTITIES if name in entry.found}
+    arrays = {
+        name: _array(entry.part(name), quantity, timed=quantity.kind != "time")
+        for name, quantity in QUANTITIES.items()
+        if name in entry.found
+    }
     rate = entry.found.get("rate_hz")
     if not {"frames", "depth_mm", "deformation_mm"} & arrays.keys():
         raise ImportSourceError(f"{entry.name} has no frames, depth_mm or deformation_mm: needs one of them; add it")

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from sensors_io.errors import MALFORMED, UserError
 from sensors_io.importers.catalogue import Taken
 from sensors_io.importers.hdf5_map import QUANTITIES, UNITS, ArrayMap, LayoutMap, RowsMap, StreamMap
 from sensors_io.importers.keep import ImportSourceError, Keep, Skip, UnreadableError
@@ -72,7 +73,9 @@ def opened(path: pathlib.Path) -> Iterator[Any]:
     try:
         with library.File(path, "r") as file:
             yield file
-    except (OSError, RuntimeError, KeyError) as error:  # h5py raises all three for damaged or cut files
+    except (UserError, UnreadableError):
+        raise
+    except (*MALFORMED, OSError, RuntimeError) as error:  # what h5py and NumPy raise for damaged or absurd files
         raise HDF5Error(f"cannot be read: {str(error).strip(chr(39))}") from error
 
 
@@ -96,7 +99,7 @@ def bounds(file: Any, group: str, rows: RowsMap) -> np.ndarray:
     found = dataset(file, group, rows.path, rows.kind)[()]
     ends = np.append(0, np.cumsum(found)) if rows.kind == "lengths" else np.asarray(found)
     whole = np.issubdtype(ends.dtype, np.integer) and ends.ndim == 1 and len(ends) > 1
-    if not whole or ends[0] < 0 or (np.diff(ends.astype(np.int64)) < 0).any():
+    if not whole or (ends.astype(np.int64) < 0).any() or (np.diff(ends.astype(np.int64)) < 0).any():  # or beyond 2⁶³
         must = (
             "lengths of all contacts" if rows.kind == "lengths" else "first rows of all contacts and the last one's end"
         )
@@ -297,9 +300,12 @@ class _Rows:
         """
         found, factor = self._raw(positions), self.array.factor
         if np.issubdtype(found.dtype, np.integer):
+            greatest = max(int(found.max(initial=0)), -int(found.min(initial=0)))
+            if greatest * int(factor) >= 2**63:
+                raise HDF5Error(f"{self.array.path} for {self.what} holds times beyond 64 bits of nanoseconds")
             found = found.astype(np.int64) * int(factor)
         else:
-            if not np.isfinite(found).all() or np.abs(found * factor).max(initial=0) >= 2**63:
+            if not np.isfinite(found).all() or np.abs(found.astype(np.float64)).max(initial=0) >= 2**63 / factor:
                 raise HDF5Error(f"{self.array.path} for {self.what} holds times that are not finite")
             found = np.rint(found.astype(np.float64) * factor).astype(np.int64)
         if (np.diff(found) < 0).any():
@@ -311,7 +317,10 @@ class _Rows:
         raw = self._raw(positions)
         if self.array.encoded:
             rows = [np.asarray(row, np.uint8).tobytes().rstrip(b"\0") for row in raw]
-            return np.stack([keep.shrink(decode_picture(row)) for row in rows])
+            pictures = [keep.shrink(decode_picture(row)) for row in rows]
+            if len({picture.shape for picture in pictures}) > 1:
+                raise HDF5Error(f"{self.array.path} for {self.what} holds pictures of different sizes")
+            return np.stack(pictures)
         if self.array.factor != 1:
             if not (np.isfinite(raw).all() and raw.min() >= 0 and raw.max() <= 1):
                 raise HDF5Error(f"{self.array.path} for {self.what} must lie in 0..1 by its unit '1'")

@@ -104,7 +104,7 @@ def _card(data: dict[str, Any]) -> ObjectCard:
 
 
 def _read(folder: pathlib.Path, key: ContactKey, data: dict[str, Any], config: Keep) -> Taken:
-    paths = [path for path in numbered(folder / "tactile") if path.stem.isdigit()]
+    paths = [path for path in numbered(folder / "tactile") if path.stem.isdecimal()]
     pictures = read_pictures(paths, config.positions(len(paths)), config)
     number = np.array([int(paths[i].stem) - 1 for i in pictures.index])
     camera = {

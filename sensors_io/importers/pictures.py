@@ -120,7 +120,7 @@ def numbered(folder: pathlib.Path, suffixes: tuple[str, ...] = (".jpg", ".jpeg",
 
 def natural(path: pathlib.Path) -> tuple[tuple[int, int | str], ...]:
     """Key that sorts the numbers in a name by value: frame_9 before frame_10."""
-    return tuple((0, int(part)) if part.isdigit() else (1, part) for part in re.findall(r"\d+|\D+", path.name))
+    return tuple((0, int(part)) if part.isdecimal() else (1, part) for part in re.findall(r"\d+|\D+", path.name))
 
 
 def film(key: ContactKey, sensor: str, *, gap: np.ndarray, host_time_ns: np.ndarray, **arrays: Any) -> Sequence:

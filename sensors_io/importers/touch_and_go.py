@@ -114,7 +114,7 @@ def _classes(lists: list[pathlib.Path]) -> tuple[dict[tuple[str, int], int], lis
         for row in read_rows(path):
             match = _LINE.fullmatch(row[0].strip())
             label = row[1].strip() if len(row) == 2 else ""
-            if match is None or not label.isdigit() or int(label) >= len(CLASSES):
+            if match is None or not label.isdecimal() or int(label) >= len(CLASSES):
                 skipped.append(
                     Skip(name=f"{path.name}: {','.join(row)}", reason="is no <session>/<10 digits>.jpg,<class>")
                 )

@@ -8,6 +8,7 @@ DIR/README.md                   model card
 """
 
 import dataclasses
+import functools
 import os
 import shutil
 import zlib
@@ -20,8 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import traverse_util
 
-from touchr1_jax.models.load import Checkpoint, load_checkpoint
-from touchr1_jax.models.lora import exported, kept_share
+from touchr1_jax.models.load import Checkpoint, WeightsError, load_checkpoint
+from touchr1_jax.models.lora import LoraConfig, by_layer, exported, kept_share
 from touchr1_jax.models.qwen.config import CONFIG_FILE
 from touchr1_jax.models.qwen.peft import PEFT_CONFIG, PEFT_WEIGHTS, load_adapters, save_adapters
 from touchr1_jax.models.qwen.safetensors import ReportBytes, read_header, read_tensor, write_file
@@ -29,11 +30,13 @@ from touchr1_jax.models.qwen.weights import INDEX, SINGLE, save_params
 from touchr1_jax.models.released_policy import ReleasedModel, ReleasedPolicy, build_released_policy, instruction
 from touchr1_jax.models.saved_policy import (
     CARD,
+    MISFITS,
     PolicyError,
     PolicyInput,
     SavedPolicy,
     default_card,
     digest_of,
+    fitting,
     format_of,
     published,
     read_policy,
@@ -42,7 +45,7 @@ from touchr1_jax.models.saved_policy import (
     seal,
 )
 from touchr1_jax.models.stacked import ADAPTERS
-from touchr1_jax.models.touch_policy import with_lora
+from touchr1_jax.models.touch_policy import touch_shapes, with_lora
 from touchr1_jax.types import Params
 
 ADAPTED, VERSION = "touchr1-adapted", 1
@@ -101,8 +104,8 @@ def read_adapted(
     """
     config = read_sealed(folder, ADAPTED, VERSION)
     try:
-        for name, digest in config["files"].items():
-            if not (folder / name).is_file() or digest_of(folder / name) != digest:
+        for name in (PEFT_CONFIG, PEFT_WEIGHTS, TOUCH_FILE):
+            if not (folder / name).is_file() or digest_of(folder / name) != config["files"][name]:
                 raise PolicyError(f"policy is {folder}: {name} is missing or damaged; copy the folder again")
         released = weights or Path(os.path.normpath(folder / config["weights"]["folder"]))
         if not released.is_dir():
@@ -114,16 +117,25 @@ def read_adapted(
         found = found or load_checkpoint(released, jnp.dtype(model.dtype), progress)
         adapters, lora = load_adapters(folder, found.config)
         policy = build_released_policy(_without_sensors(model), found, tuple(config["sensors"]))
-        lora = dataclasses.replace(rebuilt(type(lora), config["lora"]), rank=lora.rank, alpha=lora.alpha)
+        lora = _same_lora(rebuilt(LoraConfig, config["lora"]), lora, adapters)
         if instruction(policy.language) != config["prompt"]:
             raise PolicyError(f"policy is {folder}: prompt differs from this version's; use the version that wrote it")
         reads = rebuilt(PolicyInput, config["input"])
-    except (KeyError, TypeError, AttributeError) as error:
+        notes, questions = (
+            {**config["notes"]},
+            {a.name: config["questions"][a.name] for a in policy.language.attributes},
+        )
+        batch = touch_shapes(policy.model, model.view_px, tuple(config["sensors"]))
+        wanted = jax.eval_shape(functools.partial(policy.init, 0), batch)
+        touch = read_touch(folder, {name: tree for name, tree in wanted.items() if name not in policy.frozen})
+    except WeightsError:
+        raise
+    except MISFITS as error:
         raise PolicyError(f"policy is {folder}: its config does not fit ({error}); save it anew") from error
-    params: Params = {**read_touch(folder), "vision": {"tower": found.params["vision"]}, ADAPTERS: of_policy(adapters)}
+    params: Params = {**touch, "vision": {"tower": found.params["vision"]}, ADAPTERS: of_policy(adapters)}
     params["decoder"] = found.params["decoder"]
     policy = with_lora(policy, lora)
-    return SavedPolicy(policy=policy, params=params, reads=reads, notes=config["notes"], questions=config["questions"])
+    return SavedPolicy(policy=policy, params=params, reads=reads, notes=notes, questions=questions)
 
 
 def read_saved(folder: Path, weights: Path | None = None) -> SavedPolicy:
@@ -140,7 +152,7 @@ def read_saved(folder: Path, weights: Path | None = None) -> SavedPolicy:
 
 
 def export_merged(folder: Path, saved: SavedPolicy, dtype: jnp.dtype, progress: ReportBytes = SILENT) -> float:
-    """Write the released folder with the adapters merged into its weights, and the touch encoder beside them.
+    """Publish the released folder with the adapters merged into its weights, and the touch encoder beside them.
 
     Args:
       folder: new, or empty.
@@ -158,15 +170,15 @@ def export_merged(folder: Path, saved: SavedPolicy, dtype: jnp.dtype, progress: 
     assert isinstance(policy, ReleasedPolicy)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise PolicyError(f"folder is {folder}: it exists and is not empty; choose a new one")
-    folder.mkdir(parents=True, exist_ok=True)
     base = {name: jax.tree.map(lambda x: x.astype(dtype), saved.params[name]) for name in ("decoder", "vision")}
     whole = exported({**base, ADAPTERS: saved.params[ADAPTERS]}, policy.fns.lora)
-    for path in sorted(policy.checkpoint.directory.iterdir()):
-        if path.is_file() and path.suffix in COPIED and path.name != INDEX:
-            shutil.copy(path, folder)
     merged = {"vision": whole["vision"]["tower"], "decoder": whole["decoder"]}
-    save_params(folder / SINGLE, merged, policy.checkpoint.config, progress)
-    write_file(folder / TOUCH_FILE, touch_tensors(saved.params))
+    with published(folder) as unfinished:
+        for path in sorted(policy.checkpoint.directory.iterdir()):
+            if path.is_file() and path.suffix in COPIED and path.name != INDEX:
+                shutil.copy(path, unfinished)
+        save_params(unfinished / SINGLE, merged, policy.checkpoint.config, progress)
+        write_file(unfinished / TOUCH_FILE, touch_tensors(saved.params))
     return kept_share(base, whole, saved.params[ADAPTERS], policy.fns.lora)
 
 
@@ -186,17 +198,29 @@ def touch_tensors(params: Params) -> dict[str, np.ndarray]:
     return {name: np.asarray(x) for name, x in traverse_util.flatten_dict(own, sep=".").items()}
 
 
-def read_touch(folder: Path) -> Params:
+def read_touch(folder: Path, wanted: Params) -> Params:
     """The tactile encoder and its projection.
 
     Raises:
-      PolicyError: numbers that are not finite.
+      PolicyError: as `fitting`.
     """
-    flat = {name: read_tensor(entry) for name, entry in read_header(folder / TOUCH_FILE).items()}
-    infinite = sorted(name for name, x in flat.items() if not np.isfinite(x).all())
-    if infinite:
-        raise PolicyError(f"policy is {folder}: {infinite[0]} of {TOUCH_FILE} holds NaN or infinity; train it again")
-    return traverse_util.unflatten_dict({name: jnp.asarray(x) for name, x in flat.items()}, sep=".")
+    entries = read_header(folder / TOUCH_FILE)
+    return fitting(folder, {name: read_tensor(entry) for name, entry in entries.items()}, wanted)
+
+
+def _same_lora(told: LoraConfig, lora: LoraConfig, adapters: Params) -> LoraConfig:
+    """The config of adapters, which both files and the tensors must tell alike.
+
+    Raises:
+      ValueError: naming what differs.
+    """
+    layers = {tower: {path[-1] for path in by_layer(adapters) if path[0] == tower} for tower in adapters}
+    wanted = {tower: {*names} for tower, names in told.towers.items()}
+    if lora != dataclasses.replace(told, targets=lora.targets, vision_targets=lora.vision_targets):
+        raise ValueError(f"lora is {told} in {CONFIG_FILE} and {lora} in {PEFT_CONFIG}: must be the same")
+    if layers != wanted:
+        raise ValueError(f"adapters are of {layers}: must be of {wanted}")
+    return told
 
 
 def file_marks(directory: Path) -> dict[str, list[int]]:

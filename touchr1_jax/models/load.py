@@ -127,12 +127,12 @@ class Load:
 
     def run(self) -> int:
         """Read, report, and return the exit status."""
-        console, began = Console(soft_wrap=True, highlight=False), time.perf_counter()
+        console, began = Console(soft_wrap=True, highlight=False, emoji=False), time.perf_counter()
         try:
             with _bar() as progress:
                 found = load_checkpoint(self.directory, jnp.dtype(self.dtype), progress)
         except (OSError, ValueError) as error:
-            Console(stderr=True, soft_wrap=True).print(
+            Console(stderr=True, soft_wrap=True, emoji=False).print(
                 f"{type(error).__name__}: {error}", markup=False, highlight=False
             )
             return 1

@@ -13,7 +13,6 @@ import hashlib
 import json
 import os
 import shutil
-import types
 import typing
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -45,6 +44,10 @@ CHECKSUM = "checksum"
 
 Precision = Literal["float32", "float16", "int8"]
 """Type of the stored parameters; `int8` stores a matrix as 127 steps of each output's largest weight."""
+
+
+MISFITS = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError, AssertionError)
+"""Errors that a config of another version raises where it is read."""
 
 
 class PolicyError(WeightsError):
@@ -113,7 +116,7 @@ def save_policy(folder: Path, saved: SavedPolicy, *, precision: Precision = "flo
     with published(folder) as unfinished:
         write_file(unfinished / SINGLE, _stored(saved.params, precision))
         words = [piece.decode().strip() for piece in saved.policy.tokenizer.pieces if piece]
-        word_library(words).save(str(unfinished / TOKENIZER_FILE))
+        (unfinished / TOKENIZER_FILE).write_text(word_library(words).to_str(pretty=True), encoding="utf-8")
         (unfinished / CARD).write_text(card or default_card(saved, precision), encoding="utf-8")
         (unfinished / CONFIG_FILE).write_text(seal(_config(saved, precision, unfinished)), encoding="utf-8")
 
@@ -122,8 +125,9 @@ def save_policy(folder: Path, saved: SavedPolicy, *, precision: Precision = "flo
 def published(folder: Path) -> Iterator[Path]:
     """A new folder that takes the place of `folder` if the block ends without an error, and else vanishes.
 
-    Until the new one is in place the old one stays, or is put back.
+    Until the new one is in place the old one stays, or is put back.  A link is followed.
     """
+    folder = folder.resolve()
     unfinished, old = (folder.with_name(f".{folder.name}.{os.getpid()}{end}") for end in ("", ".old"))
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)
@@ -165,33 +169,33 @@ def read_policy(folder: Path) -> SavedPolicy:
         wanted = jax.eval_shape(functools.partial(policy.init, 0), touch_shapes(model, model.vision.image_px, sensors))
     except PolicyError:
         raise
-    except (
-        ValueError,
-        TypeError,
-        LookupError,
-        AttributeError,
-        ArithmeticError,
-        RecursionError,
-        AssertionError,
-    ) as error:
+    except MISFITS as error:
         raise PolicyError(
             f"policy is {folder}: its config does not fit this version ({error}); save it anew"
         ) from error
-    params = _read_params(folder)
+    params = fitting(folder, _read_params(folder), wanted)
+    return SavedPolicy(policy=policy, params=params, reads=reads, notes=notes, questions=questions)
+
+
+def fitting(folder: Path, flat: Mapping[str, np.ndarray], wanted: Params) -> Params:
+    """Parameters by dotted names as the tree that a model has.
+
+    Raises:
+      PolicyError: others than the model's, of other shapes, or numbers that are not finite.
+    """
     shapes = {name: x.shape for name, x in traverse_util.flatten_dict(wanted, sep=".").items()}
-    odd = sorted(n for n in shapes.keys() | params.keys() if n not in params or shapes.get(n) != params[n].shape)
+    odd = sorted(n for n in shapes.keys() | flat.keys() if n not in flat or shapes.get(n) != flat[n].shape)
     if odd:
         raise PolicyError(
             f"policy is {folder}: parameters differ from this version's model in {', '.join(odd[:5])}; save it anew"
         )
-    infinite = sorted(name for name, x in params.items() if not np.isfinite(x).all())
+    infinite = sorted(name for name, x in flat.items() if not np.isfinite(x).all())
     if infinite:
         raise PolicyError(
             f"policy is {folder}: {', '.join(infinite[:5])} hold numbers that are not finite: its training diverged; "
             "train it again"
         )
-    tree = traverse_util.unflatten_dict({name: jnp.asarray(x) for name, x in params.items()}, sep=".")
-    return SavedPolicy(policy=policy, params=tree, reads=reads, notes=notes, questions=questions)
+    return traverse_util.unflatten_dict({name: jnp.asarray(x) for name, x in flat.items()}, sep=".")
 
 
 def default_card(saved: SavedPolicy, precision: Precision) -> str:
@@ -244,7 +248,8 @@ def _config(saved: SavedPolicy, precision: Precision, folder: Path) -> dict[str,
 def seal(fields: Mapping[str, Any]) -> str:
     """The text of a `config.json` with the checksum of its fields."""
     plain = json.loads(json.dumps(fields))
-    return json.dumps(plain | {CHECKSUM: _digest(plain)}, indent=2, ensure_ascii=False) + "\n"
+    text = json.dumps(plain | {CHECKSUM: _digest(plain)}, indent=2, ensure_ascii=False) + "\n"
+    return text.encode(errors="backslashreplace").decode()  # bytes of a name that are no UTF-8
 
 
 def digest_of(path: Path) -> str:
@@ -322,7 +327,7 @@ def rebuilt(kind: Any, value: Any) -> Any:
     """A value of a type, which may be a dataclass, a tuple of types or a plain value, from its JSON form.
 
     Raises:
-      ValueError, TypeError: fields that the type lacks, or that it has and the value lacks.
+      ValueError, TypeError: fields that the type lacks, or that it has and the value lacks; a value of another type.
     """
     if dataclasses.is_dataclass(kind):
         hints = typing.get_type_hints(kind)
@@ -331,11 +336,16 @@ def rebuilt(kind: Any, value: Any) -> Any:
             raise ValueError(f"{getattr(kind, '__name__', kind)} differs in {sorted(names ^ value.keys())}")
         return kind(**{name: rebuilt(hints[name], value[name]) for name in names})  # type: ignore[operator]
     if typing.get_origin(kind) is tuple:
+        if not isinstance(value, list):
+            raise ValueError(f"{value!r} is given for a list")
         inner = typing.get_args(kind)
         each = [inner[0]] * len(value) if inner[-1] is Ellipsis else inner
         return tuple(rebuilt(of, item) for of, item in zip(each, value, strict=True))
-    plain = typing.get_origin(kind) in (None, Literal, typing.Union, types.UnionType)
-    return value if plain else list(value)
+    origin, allowed = typing.get_origin(kind), typing.get_args(kind)
+    types = allowed or (kind,)
+    if not (value in types if origin is Literal else type(value) in types or (type(value) is int and float in types)):
+        raise ValueError(f"{value!r} is given for {getattr(kind, '__name__', kind)}")
+    return value
 
 
 def _digest(fields: Mapping[str, Any]) -> str:

@@ -62,7 +62,7 @@ class ListRewards:
 
     def run(self) -> int:
         """Print one line per reward and return the exit status."""
-        rewards, console = all_rewards(TOUCH_LANGUAGE), Console(soft_wrap=True, highlight=False)
+        rewards, console = all_rewards(TOUCH_LANGUAGE), Console(soft_wrap=True, highlight=False, emoji=False)
         for name, reward in rewards.items():
             about = (sys.modules[reward.value.__module__].__doc__ or "").strip().partition("\n")[0]
             console.print(f"{name:<{max(map(len, rewards))}}  {about}", markup=False)
@@ -267,8 +267,8 @@ def _in_words(language: Language, asked: Sequence[str], label: Sequence[int]) ->
 
 
 def _console(stderr: bool = False) -> Console:
-    console = Console(stderr=stderr, highlight=False)
-    return console if console.is_terminal else Console(stderr=stderr, highlight=False, width=WIDTH)
+    console = Console(stderr=stderr, highlight=False, emoji=False)
+    return console if console.is_terminal else Console(stderr=stderr, highlight=False, emoji=False, width=WIDTH)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

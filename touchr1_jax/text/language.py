@@ -40,7 +40,8 @@ class Language:
     """Attributes, sensors and tags of the answers that the template writes and the parser reads.
 
     Raises:
-      ValueError: a phrase that is not lower-case words joined by single spaces or hyphens, or that means two things.
+      ValueError: an attribute of fewer than two levels; a phrase that is not lower-case words joined by single spaces
+        or hyphens, or that means two things.
     """
 
     attributes: tuple[Attribute, ...]
@@ -49,6 +50,10 @@ class Language:
 
     def __post_init__(self) -> None:
         for attribute in self.attributes:
+            if len(attribute.levels) < 2:
+                raise ValueError(
+                    f"attribute {attribute.name} has levels {attribute.levels}: must be two or more; add one"
+                )
             owner: dict[str, int] = {}
             for level, words in enumerate(attribute.levels):
                 for word in words:

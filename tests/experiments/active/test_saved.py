@@ -1,7 +1,9 @@
 """A saved policy asks for contacts until it concludes, and a folder gives back what was saved."""
 
+import dataclasses
 import json
 
+import jax
 import numpy as np
 import pytest
 
@@ -65,6 +67,24 @@ def test_a_damaged_folder_is_named(tmp_path, damage):
         (folder / "config.json").write_text(json.dumps(fields | {"version": 99}))
     with pytest.raises(PolicyError, match=str(folder)):
         read_explorer(folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda one: {"scale": 0.0}, "scale is 0.0 and budget 2"),
+        (lambda one: {"budget": 0}, "budget 0: must be"),
+        (lambda one: {"params": jax.tree.map(lambda x: x * np.nan, one.params)}, "not finite: its training diverged"),
+        (lambda one: {"params": jax.tree.map(lambda x: x[:-1], one.params)}, "of another shape"),
+        (lambda one: {"contacts": dataclasses.replace(one.contacts, forces_n=(1.0, 2.0))}, "of another shape"),
+        (lambda one: {"encoder": dataclasses.replace(one.encoder, width=16)}, "of another shape"),
+    ],
+)
+def test_parameters_that_answer_nothing_are_refused(tmp_path, change, message):
+    one = explorer(0)
+    save_explorer(tmp_path / "policy", dataclasses.replace(one, **change(one)))
+    with pytest.raises(PolicyError, match=message):
+        read_explorer(tmp_path / "policy")
 
 
 def test_other_folders_are_no_explorers(tmp_path):

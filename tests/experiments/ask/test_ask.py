@@ -22,6 +22,8 @@ from experiments.core.errors import DataError
 from experiments.core.runs import ROOT
 from experiments.study.policies import find_policy, is_policy, publish_policy
 from experiments.study.stages import encode_rows
+from sensors_io.commands.console import print_in_any_encoding
+from sensors_io.errors import UserError
 from sensors_io.remote import CACHE
 from sensors_io.schema import SENSORS
 from tests.sensors_io.importers.films import film
@@ -152,12 +154,18 @@ def test_inputs_are_read_as_training_data_are(asked, tmp_path):
         ("RECORDS:99", "must name a contact 0..15 or an object"),
         ("FILE", "does not open as a video"),
         ("EMPTY", "holds neither records nor pictures"),
+        ("CUT", r"cut/2\.png is cut off, remove it"),
     ],
 )
 def test_what_is_no_input_is_named(asked, records, tmp_path, source, message):
-    (tmp_path / "empty").mkdir()
+    for name in ("empty", "cut"):
+        (tmp_path / name).mkdir()
     (tmp_path / "file.mp4").write_text("no video")
-    for name, path in (("RECORDS", records), ("FILE", tmp_path / "file.mp4"), ("EMPTY", tmp_path / "empty")):
+    picture = cv2.imencode(".png", np.zeros((24, 32, 3), np.uint8))[1].tobytes()
+    for n, content in ((1, picture), (2, picture[:-9])):
+        (tmp_path / "cut" / f"{n}.png").write_bytes(content)
+    places = {"RECORDS": records, "FILE": tmp_path / "file.mp4", "EMPTY": tmp_path / "empty", "CUT": tmp_path / "cut"}
+    for name, path in places.items():
         source = source.replace(name, str(path))
     with pytest.raises(DataError, match=message):
         read_touch(source, asked.saved)
@@ -189,11 +197,48 @@ def test_what_cannot_be_asked_is_one_line(runs, records, capsys):
         (("trial", records, "--question", "How heavy is it?"), "it names no attribute"),
         (("trial", records, "--question", "Which is harder?"), "give two INPUTs, or ask about one, as in 'how hard"),
         (("trial",), "must be at most one POLICY and one or two INPUTs"),
+        (("trial", f"{records}:-1"), ":-1: must name a contact"),
+        (("trial", "generated:3", "--sensor", "nose"), "sensor is 'nose': the policy reads"),
+        (("trial", records, "--every", "all", "--html", "page.html"), "goes without --question, --sensor and --html"),
     ):
         assert ask(runs, *words) == 1
         error = capsys.readouterr().err
         assert message in error
         assert "Traceback" not in error
+
+
+def test_notes_and_levels_of_another_version_are_named_or_left_out(asked):
+    for scenes in ([1], "x", {"image_px": "a"}):
+        odd = dataclasses.replace(asked.saved, notes={"scenes": scenes})
+        with pytest.raises(DataError, match="notes scenes that this version cannot generate"):
+            read_touch("generated:3", odd)
+    hardness, *others = asked.saved.policy.language.attributes
+    fewer = dataclasses.replace(hardness, levels=hardness.levels[:2])
+    language = dataclasses.replace(asked.saved.policy.language, attributes=(fewer, *others))
+    odd = dataclasses.replace(asked.saved, policy=dataclasses.replace(asked.saved.policy, language=language))
+    assert read_touch("generated:3", odd).truth.keys() == {"roughness", "protrusion", "material"}
+
+
+def test_a_name_that_is_not_utf_8_gets_a_page(runs, tmp_path, capsys):
+    print_in_any_encoding()
+    folder = tmp_path / "p\udcff"
+    folder.mkdir()
+    (folder / "1.png").write_bytes(cv2.imencode(".png", np.zeros((24, 32, 3), np.uint8))[1].tobytes())
+    assert ask(runs, "trial", folder, "--html", tmp_path / "page.html") == 0
+    assert r"p\udcff" in (tmp_path / "page.html").read_text(encoding="utf-8")
+    for page in ("", "/dev/null"):
+        assert ask(runs, "trial", folder, "--html", page) == 1
+        assert "must be a file" in capsys.readouterr().err
+
+
+def test_a_damaged_result_is_named_where_its_card_is_written(runs, tmp_path, capsys):
+    results = runs / "trial" / "latest" / "results.json"
+    before = results.read_text()
+    for text in ("[]", '{"arms": 3}', '{"arms": {"sft": {"acc": {}}}, "data": {}}'):
+        results.write_text(text)
+        assert run_asking(["export", "trial", str(tmp_path / "p"), "--runs-dir", str(runs)]) == 1
+        assert "results.json is not that of a run" in capsys.readouterr().err
+    results.write_text(before)
 
 
 def test_an_exported_folder_and_a_repository_of_the_hub_are_policies(runs, asked, tmp_path, monkeypatch, capsys):
@@ -261,6 +306,12 @@ def test_the_demo_answers_about_objects_and_videos(address, tmp_path):
     assert fetch(address, "video?name=press.avi&sensor=xense", b"no video")[0] == 400
     assert "no property" in fetch(address, "generated?words=squishy")[1]
     assert fetch(address, "records")[0] == 404
+
+
+@pytest.mark.parametrize("port", [-1, 65_536])
+def test_a_port_that_is_none_is_named(asked, port):
+    with pytest.raises(UserError, match=rf"port is {port}: must lie in 0\.\.65535"), demo_server(asked, port):
+        pass
 
 
 def test_the_demo_is_closed_to_other_pages_and_files(address, records):

@@ -1,6 +1,7 @@
 """The command asks for one touch after the other, and takes recordings of a person or of a generated object."""
 
 import io
+import re
 
 import cv2
 import numpy as np
@@ -44,9 +45,16 @@ def test_a_person_answers_with_pictures(saved, tmp_path, monkeypatch, capsys):
 
 
 def test_contacts_that_cannot_be_made_are_not_observed(saved, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("sys.stdin", io.StringIO(""))
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n" * 9))
     assert ask(saved, tmp_path) == 0
-    assert "%" in capsys.readouterr().out.splitlines()[-1]
+    assert re.search(r"%.*after (\d) touch.*; \1 of them could not be made", capsys.readouterr().out.splitlines()[-1])
+
+
+@pytest.mark.parametrize("said", [b"", b"\xff\xfe\n"])
+def test_answers_that_end_are_no_answer(saved, tmp_path, monkeypatch, capsys, said):
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(said), encoding="utf-8"))
+    assert ask(saved, tmp_path) == 1
+    assert "the answers ended before the policy concluded" in capsys.readouterr().err
 
 
 @pytest.mark.slow  # generates contacts

@@ -7,8 +7,9 @@ import pytest
 from experiments.core.artifacts import read_json
 from experiments.core.runner import main
 from experiments.core.runs import locate
-from experiments.core.sweep import SweepError, chart, chosen_figures, plan
+from experiments.core.sweep import SweepError, plan
 from experiments.core.sweep import main as sweep
+from experiments.core.sweep_figures import chart, chosen_figures
 from tests.experiments.core.test_report import read
 from tests.experiments.fakes import coin
 
@@ -70,6 +71,27 @@ def test_a_sweep_with_more_values_keeps_what_its_folder_holds(workplace, capsys)
     assert locate("coin", Path("mine")) == directories(Path("mine"))[-1].resolve()
 
 
+def test_a_folder_of_another_sweep_and_damaged_runs_are_named(workplace, capsys):
+    one = ("coin", "--steps", "1", "--seeds", "2", "--into", "mine", "--vary")
+    assert sweep((*one, "toss.bias=0.1,0.9"), package=FAKES) == 0
+    before = Path("mine/sweep.json").read_bytes()
+    for other in ("toss.bias=0.1", "coin=gold,silver"):
+        assert sweep((*one, other), package=FAKES) == 1
+        assert "runs that this one leaves out" in capsys.readouterr().err
+    assert Path("mine/sweep.json").read_bytes() == before
+    results = directories(Path("mine"))[0] / "results.json"
+    for text in ("{", "[]", '{"verdict": [], "arms": 3}', '{"verdict": [], "arms": {"paid": {"acc": {"mean": 1}}}}'):
+        results.write_text(text)
+        assert sweep((*one, "toss.bias=0.1,0.9"), package=FAKES) == 1
+        assert "DamagedFileError" in capsys.readouterr().err
+
+
+def test_a_folder_may_have_a_name_that_is_not_utf_8(workplace):
+    arguments = ("coin", "--vary", "toss.bias=0.1", "--steps", "1", "--seeds", "2", "--into", "n\udcff")
+    assert sweep(arguments, package=FAKES) == 0
+    assert read_json(Path("n\udcff/sweep.json"))["units"][0]["command"][-1] == "n\udcff"
+
+
 @pytest.mark.parametrize(
     ("vary", "rest", "what"),
     [
@@ -79,6 +101,8 @@ def test_a_sweep_with_more_values_keeps_what_its_folder_holds(workplace, capsys)
         ([], [], "no option varies"),
         (["steps=3,03"], [], "are one configuration"),
         (["steps=3"], ["--fresh"], "--fresh belongs to single runs"),
+        (["fresh=true"], [], "--fresh belongs to single runs"),
+        (["runs-dir=x"], [], "--runs-dir belongs to single runs"),
     ],
 )
 def test_options_that_make_no_sweep_are_named(vary, rest, what):

@@ -23,8 +23,9 @@ from touchr1_jax.models.load import Load, WeightsError, load_checkpoint
 from touchr1_jax.models.lora import with_adapters
 from touchr1_jax.models.qwen.config import released
 from touchr1_jax.models.qwen.config_file import parse_config
+from touchr1_jax.models.qwen.safetensors import read_header, read_tensor, write_file
 from touchr1_jax.models.released_policy import build_released_policy, instruction, longest_answer, plain_answers
-from touchr1_jax.models.saved_policy import PolicyError, PolicyInput, SavedPolicy
+from touchr1_jax.models.saved_policy import PolicyError, PolicyInput, SavedPolicy, digest_of, seal
 
 SFT = StudySFT(batch_size=3, questions=2, micro_contacts=1)
 
@@ -145,6 +146,40 @@ def test_a_damaged_folder_is_named(folder, tmp_path, file, message):
     (tmp_path / "copy" / file).write_bytes(content.replace(old, new, 1))
     with pytest.raises(PolicyError, match=message):
         read_adapted(tmp_path / "copy")
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "message"),
+    [
+        (
+            "touch_encoder.safetensors",
+            lambda t: {n: x[:-1] for n, x in t.items()},
+            "parameters differ from this version's",
+        ),
+        ("touch_encoder.safetensors", lambda t: {}, "parameters differ from this version's"),
+        ("touch_encoder.safetensors", lambda t: {n: x * np.nan for n, x in t.items()}, "are? not finite"),
+        ("adapter_model.safetensors", lambda t: {n: x for n, x in t.items() if "q_proj" not in n}, "adapters are of"),
+        ("adapter_model.safetensors", lambda t: {n: x[:1] for n, x in t.items()}, "of rank 2"),
+        ("config.json", lambda c: {n: x for n, x in c.items() if n != "notes"}, "its config does not fit .*'notes'"),
+        ("config.json", lambda c: c | {"questions": []}, "its config does not fit"),
+        ("config.json", lambda c: c | {"files": {}}, "its config does not fit"),
+        ("config.json", lambda c: c | {"lora": c["lora"] | {"rank_stabilised": True}}, "must be the same"),
+    ],
+)
+def test_a_folder_of_another_version_is_named(folder, tmp_path, file, change, message):
+    """Its checksums hold."""
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    config = json.loads((copy / "config.json").read_text())
+    del config["checksum"]
+    if file == "config.json":
+        config = change(config)
+    else:
+        write_file(copy / file, change({n: read_tensor(e) for n, e in read_header(copy / file).items()}))
+        config["files"][file] = digest_of(copy / file)
+    (copy / "config.json").write_text(seal(config))
+    with pytest.raises(PolicyError, match=message):
+        read_adapted(copy)
 
 
 def test_released_weights_that_are_missing_or_others_are_named(saved, weights, tmp_path):

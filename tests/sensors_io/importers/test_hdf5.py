@@ -255,3 +255,32 @@ def test_contacts_of_one_object_without_numbers_are_numbered_in_linear_time(tmp_
     catalogue = list_hdf5(tmp_path, config)
     assert [listed.key.trial for listed in catalogue.contacts] == list(range(count))
     assert time.process_time() - began < 2.0
+
+
+def test_absurd_values_and_sizes_are_left_out_by_name(tmp_path):
+    """Numbers that are cut to whole ones, times beyond 64 bits, a picture beyond memory, pictures of two sizes."""
+    small, large = (cv2.imencode(".png", RGB[0, :rows])[1] for rows in (4, 8))
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        trial(file.create_group("trials/t"))
+        file["huge"] = 2**62 + np.arange(6)
+        file["late"] = np.arange(6) * 1e300
+        file.create_dataset("wide", (6, 10**6, 10**6, 3), np.uint8, chunks=(1, 100, 100, 3))
+        file["rows"] = [2**62, 2**62]
+        jpg = file.create_dataset("pictures", (6,), h5py.vlen_dtype(np.uint8))
+        for i in range(6):
+            jpg[i] = small if i % 2 else large
+    second = {"unit": "s", "path": "/huge"}
+    for changes, reason in (
+        ({"labels": {"hardness": {"value": 1.7}}}, "hardness is 1.7: must be a whole number"),
+        ({"site": {"value": 2**32}}, "site is 4294967296: must lie in 0"),
+        ({"mini": {"host_time_ns": second}}, "beyond 64 bits of nanoseconds"),
+        ({"mini": {"host_time_ns": second | {"path": "/late"}}}, "times that are not finite"),
+        ({"mini": {"frames": {"path": "/wide"}, "depth_mm": None}}, "cannot be read: Unable to allocate"),
+        ({"mini": {"frames": {"path": "/pictures", "encoded": True}}}, "pictures of different sizes"),
+        ({"mini": {"frames": {"path": "mini/rgb", "rows": {"lengths": "/rows"}}}}, "/rows must hold the lengths"),
+        ({"mini": {"frames": {"path": "\ud800"}}}, "cannot be read: .*surrogates not allowed"),
+    ):
+        with pytest.raises(ImportSourceError, match=f"no contact can be read.*{reason}"):
+            imported(tmp_path, mapped(**changes))
+    with pytest.raises(ImportSourceError, match="host_time_ns: 'time' must be one of"):
+        imported(tmp_path, mapped(mini={"host_time_ns": second | {"time": second}}))

@@ -50,6 +50,7 @@ def test_names_are_ordered_by_their_numbers(tmp_path):
     assert [path.name for path in numbered(tmp_path)] == ["frame_9.png", "frame_10.png", "frame_100.png"]
     assert numbered(tmp_path / "absent") == []
     assert natural(tmp_path / "a2b") < natural(tmp_path / "a10b")
+    assert natural(tmp_path / "a٢b") < natural(tmp_path / "a10b") < natural(tmp_path / "a10²1")
 
 
 @pytest.mark.parametrize(

@@ -121,6 +121,10 @@ def sign(folder, change):
         lambda c: c["model"]["tactile"].update(width=10**400),
         lambda c: c.update(language=[]),
         lambda c: c.update(questions=None),
+        lambda c: c["input"].update(rejected=[3]),
+        lambda c: c["input"].update(rejected="SATURATED"),
+        lambda c: c["input"].update(force="no"),
+        lambda c: c["language"]["attributes"][0].update(levels=[]),
     ],
 )
 def test_a_config_of_another_version_is_named(folder, change):
@@ -148,6 +152,24 @@ def test_what_is_no_policy_is_named(folder, message):
     DAMAGE[message](folder)
     with pytest.raises(PolicyError, match=message):
         load_policy(folder)
+
+
+def test_a_link_to_a_policy_stays_a_link(saved, folder):
+    link = folder.with_name("link")
+    link.symlink_to(folder.name)
+    save_policy(link, dataclasses.replace(saved, notes={"name": "second"}))
+    assert link.is_symlink()
+    assert read_policy(folder).notes == {"name": "second"}
+    assert sorted(p.name for p in folder.parent.iterdir()) == ["link", "policy"]
+
+
+def test_a_folder_may_have_any_name(saved, tmp_path, monkeypatch):
+    save_policy(tmp_path / "p\udcff", saved)
+    assert read_policy(tmp_path / "p\udcff").notes == saved.notes
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    save_policy(Path(), saved)
+    assert read_policy(tmp_path / "here").notes == saved.notes
 
 
 def test_a_policy_that_cannot_be_replaced_stays(saved, folder, monkeypatch):

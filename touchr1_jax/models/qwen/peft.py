@@ -12,15 +12,26 @@ import numpy as np
 from touchr1_jax.models.lora import Adapter, Adapters, LoraConfig, by_layer, nested
 from touchr1_jax.models.qwen import names
 from touchr1_jax.models.qwen.config import QwenConfig
-from touchr1_jax.models.qwen.safetensors import read_header, read_tensor, write_file
+from touchr1_jax.models.qwen.safetensors import DTYPES, read_header, read_tensor, write_file
 
 PEFT_CONFIG, PEFT_WEIGHTS = "adapter_config.json", "adapter_model.safetensors"
 PREFIX = "base_model.model."
 FACTORS = {"a": "lora_A", "b": "lora_B"}
 """Our factors, [in, r] and [r, out], and PEFT's, which are turned."""
 
-REFUSED = {"bias": "none", "use_dora": False, "fan_in_fan_out": False, "modules_to_save": None, "rank_pattern": {}}
+REFUSED = {
+    "bias": "none",
+    "use_dora": False,
+    "fan_in_fan_out": False,
+    "modules_to_save": None,
+    "rank_pattern": {},
+    "alpha_pattern": {},
+    "layer_replication": None,
+}
 """Fields of a config and the values without which adapters compute something else than here."""
+
+MOST_ALPHA = 1e6
+"""No training has more; a number that is no float would pass as one."""
 
 
 def save_adapters(folder: Path, adapters: Adapters, config: QwenConfig, lora: LoraConfig, base: str) -> None:
@@ -66,9 +77,14 @@ def load_adapters(folder: Path, config: QwenConfig) -> tuple[Adapters, LoraConfi
     for name in (PEFT_CONFIG, PEFT_WEIGHTS):
         if not (folder / name).is_file():
             raise FileNotFoundError(f"{folder / name} is no file: must be a part of saved adapters; correct the folder")
-    fields = json.loads((folder / PEFT_CONFIG).read_text(encoding="utf-8"))
-    lora = read_lora(fields, folder / PEFT_CONFIG)
-    entries = {_canonical(key): entry for key, entry in read_header(folder / PEFT_WEIGHTS).items()}
+    try:
+        fields = json.loads((folder / PEFT_CONFIG).read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{folder / PEFT_CONFIG} is no JSON ({error}); copy it again") from error
+    lora, header = read_lora(fields, folder / PEFT_CONFIG), read_header(folder / PEFT_WEIGHTS)
+    entries = {_canonical(key): entry for key, entry in header.items()}
+    if not entries or len(entries) < len(header):
+        raise ValueError(f"{folder / PEFT_WEIGHTS}: has no adapter, or one of them twice; save the adapters anew")
     layers: dict[names.Path, dict[int | None, Adapter]] = {}
     for s in names.sources(config).values():
         keys = [f"{s.key.removesuffix('.weight')}.{FACTORS[name]}.weight" for name in ("a", "b")]
@@ -77,9 +93,11 @@ def load_adapters(folder: Path, config: QwenConfig) -> tuple[Adapters, LoraConfi
         out, inp = s.shape
         factors: list[Any] = []
         for key, shape in zip(keys, ((lora.rank, inp), (out, lora.rank)), strict=True):
-            if key not in entries or entries[key].shape != shape:
-                told = entries[key].shape if key in entries else "missing"
-                raise ValueError(f"{folder / PEFT_WEIGHTS}: {key} is {told}: must be {shape} of rank {lora.rank}")
+            if key not in entries or entries[key].shape != shape or entries[key].dtype not in DTYPES:
+                told = f"{entries[key].dtype} {entries[key].shape}" if key in entries else "missing"
+                raise ValueError(
+                    f"{folder / PEFT_WEIGHTS}: {key} is {told}: must be {shape} of rank {lora.rank}, of real numbers"
+                )
             factors.append(read_tensor(entries.pop(key)).astype(np.float32).T)
             if not np.isfinite(factors[-1]).all():
                 raise ValueError(f"{folder / PEFT_WEIGHTS}: {key} holds NaN or infinity; its training diverged")
@@ -101,10 +119,13 @@ def read_lora(fields: Mapping[str, Any], where: Path) -> LoraConfig:
     odd = [name for name, value in wanted.items() if (fields.get(name, value) or None) != (value or None)]
     if odd:
         raise ValueError(f"{where}: {odd[0]} is {fields[odd[0]]!r}: must be {wanted[odd[0]]!r}; nothing else is read")
-    rank, alpha = fields.get("r"), fields.get("lora_alpha")
-    if type(rank) is not int or rank < 1 or not isinstance(alpha, int | float):
-        raise ValueError(f"{where}: r is {rank!r} and lora_alpha {alpha!r}: must be numbers above 0; correct them")
-    return LoraConfig(rank=rank, alpha=float(alpha), rank_stabilised=bool(fields.get("use_rslora")))
+    rank, alpha, stabilised = fields.get("r"), fields.get("lora_alpha"), fields.get("use_rslora", False)
+    if type(rank) is not int or rank < 1 or type(alpha) not in (int, float) or not 0 < alpha <= MOST_ALPHA:
+        told = f"r is {rank!r} and lora_alpha {str(alpha)[:20]}"
+        raise ValueError(f"{where}: {told}: must be a whole number ≥ 1 and a number above 0; correct them")
+    if type(stabilised) is not bool:
+        raise ValueError(f"{where}: use_rslora is {stabilised!r}: must be true or false; correct it")
+    return LoraConfig(rank=rank, alpha=float(alpha), rank_stabilised=stabilised)
 
 
 def target_pattern(lora: LoraConfig) -> str:

@@ -80,6 +80,9 @@ LAST = f"{PREFIX}language_model.layers.1.mlp.down_proj.lora_B.weight"
         (lambda t: {**t, LAST: t[LAST][:-1]}, r"must be \(64, 3\) of rank 3"),
         (lambda t: {**t, LAST: t[LAST] * np.float32(np.nan)}, "holds NaN or infinity"),
         (lambda t: {n: x for n, x in t.items() if "blocks.1.attn.qkv" not in n}, "layer 1 has no adapter of qkv"),
+        (lambda t: {**t, LAST: t[LAST].astype(np.int8)}, r"is I8 \(64, 3\): must be .* of real numbers"),
+        (lambda t: {}, "has no adapter"),
+        (lambda t: {**t, LAST.replace("lora_B", "lora_B.default"): t[LAST] * 2}, "or one of them twice"),
     ],
 )
 def test_misfits_are_named(folder, change, message):
@@ -94,7 +97,12 @@ def test_misfits_are_named(folder, change, message):
         ("peft_type", "LOHA", "peft_type is 'LOHA': must be 'LORA'"),
         ("use_dora", True, "use_dora is True: must be False"),
         ("bias", "all", "bias is 'all': must be 'none'"),
-        ("r", 0, "r is 0 and lora_alpha 5.0: must be numbers above 0"),
+        ("r", 0, "r is 0 and lora_alpha 5.0: must be"),
+        ("lora_alpha", float("inf"), "lora_alpha inf: must be"),
+        ("lora_alpha", 10**400, "must be a whole number ≥ 1 and a number above 0"),
+        ("use_rslora", "false", "use_rslora is 'false': must be true or false"),
+        ("alpha_pattern", {"q_proj": 64}, r"alpha_pattern is {'q_proj': 64}: must be {}"),
+        ("layer_replication", [[0, 2]], "layer_replication is"),
     ],
 )
 def test_other_kinds_of_adapters_are_named(folder, field, value, message):
@@ -104,9 +112,12 @@ def test_other_kinds_of_adapters_are_named(folder, field, value, message):
         load_adapters(folder, CONFIG)
 
 
-def test_a_config_that_is_no_object_is_named(folder):
-    (folder / "adapter_config.json").write_text("[]")
-    with pytest.raises(ValueError, match="must be a JSON object"):
+@pytest.mark.parametrize(
+    ("text", "message"), [("[]", "must be a JSON object"), ("[" * 100_000, "is no JSON .*; copy it again")]
+)
+def test_a_config_that_is_no_object_is_named(folder, text, message):
+    (folder / "adapter_config.json").write_text(text)
+    with pytest.raises(ValueError, match=message):
         load_adapters(folder, CONFIG)
 
 
