@@ -33,8 +33,8 @@ def run_at(url: str, name: str, execute: Callable[[Path], int]) -> int:
     Raises:
       StoreError: before anything is computed, if the store cannot be read.
     """
-    remote, runs_dir = Mirror(f"{url}/{name}"), Path(tempfile.mkdtemp(prefix="touchr1-runs-"))
-    copier, ended = _Copier(remote, runs_dir / name), threading.Event()
+    runs_dir = Path(tempfile.mkdtemp(prefix="touchr1-runs-"))
+    copier, ended = _Copier(Mirror(f"{url}/{name}"), runs_dir / name), threading.Event()
     copier.fetch()
     copying = threading.Thread(target=copier.copy_until, args=(ended,), daemon=True)
     copying.start()
@@ -43,14 +43,8 @@ def run_at(url: str, name: str, execute: Callable[[Path], int]) -> int:
     finally:
         ended.set()
         copying.join()
-    try:
-        copier.copy()
-    except StoreError as error:
-        print_error(f"StoreError: {error}\nThe run is in {runs_dir / name}: copy it to {remote} yourself, or lose it")
-        return code or 1
-    shutil.rmtree(runs_dir)
-    print_lines(f"the run is at {remote}")
-    return code
+        copied = copier.finish()
+    return code if copied else code or 1
 
 
 class _Copier:
@@ -75,8 +69,19 @@ class _Copier:
         while not ended.wait(EVERY_S):
             try:
                 self.copy()
-            except StoreError as error:
+            except (StoreError, OSError) as error:  # a checkpoint may be removed while its folder is read
                 _LOG.warning("%s: the run goes on, and is copied in %g s", error, EVERY_S)
+
+    def finish(self) -> bool:
+        """Copy the end of a run and remove it here; false, with a line, if the store does not take it."""
+        try:
+            self.copy()
+        except StoreError as error:
+            print_error(f"StoreError: {error}\nThe run is in {self._folder}: copy it to {self._remote} yourself")
+            return False
+        shutil.rmtree(self._folder.parent)
+        print_lines(f"the run is at {self._remote}")
+        return True
 
     def copy(self) -> None:
         """Copy what changed.
