@@ -6,9 +6,6 @@ import os
 import signal
 import sys
 
-from experiments.core.commands import ASKING, SWEEP, print_error, run_command
-from sensors_io.commands.console import print_in_any_encoding
-
 SIGNALLED = 128
 """Exit statuses above it are those of a run that a signal stopped."""
 
@@ -28,11 +25,22 @@ def leave(status: int) -> None:
     sys.exit(status)
 
 
+def say(text: str) -> None:
+    """Print to standard error; nothing is imported for it."""
+    sys.stderr.write(f"{text}\n")
+
+
 def main() -> None:
-    """Run the command line and end the process."""
+    """Run the command line and end the process.
+
+    A second or more goes by until all is imported, in which Ctrl-C is answered too.
+    """
     arguments = sys.argv[1:]
-    print_in_any_encoding()
     try:
+        from experiments.core.commands import ASKING, SWEEP, run_command
+        from sensors_io.commands.console import print_in_any_encoding
+
+        print_in_any_encoding()
         if arguments and arguments[0] in ASKING:
             from experiments.ask.command import run_asking
 
@@ -47,11 +55,11 @@ def main() -> None:
 
             status = run(arguments)
     except KeyboardInterrupt:  # a run handles the signal itself
-        print_error("Stopped before any work began.")
+        say("Stopped; nothing is half-written, and the same command can be run again.")
         status = SIGNALLED + signal.SIGINT
     except OSError as error:  # a folder that cannot be read or written, a full disk, a pipe that was closed
         with contextlib.suppress(OSError):
-            print_error(f"{type(error).__name__}: {error}: correct the path, its permissions, or free some space")
+            say(f"{type(error).__name__}: {error}: correct the path, its permissions, or free some space")
         status = 1
     leave(status)
 

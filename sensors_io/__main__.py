@@ -9,10 +9,6 @@ import sys
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-import tyro
-
-from sensors_io.commands.console import ERR, OUT, complain, print_in_any_encoding
-from sensors_io.commands.values import require_possible
 from sensors_io.errors import UserError
 
 PROG = "python -m sensors_io"
@@ -48,15 +44,24 @@ PLUS = "+"
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run one command; known errors become one line on stderr and exit status 1.
+    """Run one command; known errors become one line on stderr and exit status 1, Ctrl-C, also during imports, 130.
 
     Args:
       args: the command line; None takes that of the process.
     """
-    args = sys.argv[1:] if args is None else args
+    try:
+        return _run(sys.argv[1:] if args is None else args)
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted: run the same command again to resume\n")
+        return 130
+
+
+def _run(args: list[str]) -> int:
     # before NumPy is loaded: its matrices are small here, and on a busy machine a second thread costs `calibrate` six
     # times the processor time and, by another order of sums, other bits
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from sensors_io.commands.console import ERR, OUT, complain, print_in_any_encoding
+
     print_in_any_encoding()
     if not args or args[0] in ("-h", "--help"):
         OUT.print("\n".join(usage()), markup=False, highlight=False, soft_wrap=True)
@@ -67,6 +72,8 @@ def main(args: list[str] | None = None) -> int:
         told = [f"There is no command {args[0]!r}.{asked}", *usage()]
         ERR.print("\n".join(told), markup=False, highlight=False, soft_wrap=True)
         return 2
+    from sensors_io.commands.values import require_possible
+
     try:
         try:
             command = read(args)
@@ -78,9 +85,6 @@ def main(args: list[str] | None = None) -> int:
     except (UserError, OSError) as error:
         complain(error)
         return 1
-    except KeyboardInterrupt:
-        ERR.print("interrupted: run the same command again to resume")
-        return 130
 
 
 def read(args: list[str]) -> Any:
@@ -90,6 +94,8 @@ def read(args: list[str]) -> Any:
       SystemExit: code 2 after an answer to what is not understood, 0 after help.
       DeviceNotFoundError: devices for a command that takes none.
     """
+    import tyro
+
     first, *others = _sections(args[1:])
     module, _, kind = COMMANDS[args[0]].partition(".")
     made = getattr(importlib.import_module(f"sensors_io.commands.{module}"), kind)

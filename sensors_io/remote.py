@@ -26,6 +26,7 @@ CACHE, CACHE_GB = "TOUCHR1_CACHE", "TOUCHR1_CACHE_GB"
 
 _COPY = re.compile(r"[0-9a-f]{24}-.+")  # name of a copy in the cache; nothing else is ever removed from its folder
 _URL = re.compile(r"([a-z][a-z0-9+]+):/+(.+)")  # one slash is left where a URL was made a path
+_ABSOLUTE = ("file", "local")  # kinds whose paths begin at the root, whatever a path made of the slashes
 _LOG = logging.getLogger(__name__)
 _SLOW_S = 10.0  # from which on a line says that a request is waited for
 _AHEAD = 4  # files at once: one stream alone does not fill the line to a store
@@ -55,13 +56,18 @@ class Mirror:
         if (found := _URL.fullmatch(url)) is None:
             raise StoreError(f"url is {url!r}: must be KIND://PATH, as in s3://bucket/records; correct it")
         kind, path = found.groups()
-        self.url, self._path = f"{kind}://{path}", path.rstrip("/")
+        root = "/" if kind in _ABSOLUTE else ""
+        self.url, self._path = f"{kind}://{root}{path}", f"{root}{path}".rstrip("/")
         try:
-            self._store = fsspec.filesystem(kind, use_listings_cache=False)
-        except (ImportError, ValueError) as error:
+            more = {"auto_mkdir": True} if root else {}
+            self._store = fsspec.filesystem(kind, use_listings_cache=False, **more)
+        except Exception as error:  # each kind has errors of its own
             fix = "must be of a kind that fsspec knows, its package installed; pip install 'touchr1-jax[cloud]'"
             raise StoreError(f"{self.url} cannot be opened ({error}): {fix}") from error
-        self._cache = pathlib.Path(os.environ.get(CACHE, "~/.cache/touchr1")).expanduser()
+        try:
+            self._cache = pathlib.Path(os.environ.get(CACHE, "~/.cache/touchr1")).expanduser()
+        except RuntimeError as error:
+            raise StoreError(f"{CACHE} is {os.environ.get(CACHE)!r}: {error}; set it to a folder") from error
         stated = os.environ.get(CACHE_GB, "50")
         if re.fullmatch(r"(\d+\.?\d*|\.\d+)(e-?\d)?", stated) is None:
             raise StoreError(f"{CACHE_GB} is {stated!r}: must be a number of gigabytes ≥ 0; correct it, or unset it")

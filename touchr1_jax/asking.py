@@ -268,12 +268,8 @@ def fetch(repository: str) -> Path:
     Raises:
       PolicyError: no such repository, or it cannot be reached.
     """
-    import huggingface_hub  # takes a second; only policies of the hub need it
-
-    try:
-        return Path(huggingface_hub.snapshot_download(repository))
-    except (OSError, ValueError) as error:  # its errors, those of the network among them, are these
-        raise PolicyError(f"policy is {HUB}{repository}: cannot be fetched ({error}); correct the name") from error
+    with _hub(f"policy is {HUB}{repository}: cannot be fetched", "correct the name") as hub:
+        return Path(hub.snapshot_download(repository))
 
 
 def push(saved: SavedPolicy, repository: str, *, precision: Precision = "float32", card: str = "") -> str:
@@ -286,16 +282,28 @@ def push(saved: SavedPolicy, repository: str, *, precision: Precision = "float32
     Raises:
       PolicyError: it cannot be reached, or not be written to.
     """
-    import huggingface_hub
-
     with tempfile.TemporaryDirectory() as home:
         folder = Path(home) / "policy"
         save_policy(folder, saved, precision=precision, card=card)
-        try:
-            huggingface_hub.create_repo(repository, exist_ok=True)
-            return str(huggingface_hub.upload_folder(repo_id=repository, folder_path=folder))
-        except (OSError, ValueError) as error:
-            raise PolicyError(f"{HUB}{repository} cannot be written ({error}): log in by `hf auth login`") from error
+        with _hub(f"{HUB}{repository} cannot be written", "correct the name, or log in by `hf auth login`") as hub:
+            hub.create_repo(repository, exist_ok=True)
+            return str(hub.upload_folder(repo_id=repository, folder_path=folder))
+
+
+@contextlib.contextmanager
+def _hub(what: str, fix: str) -> Iterator[Any]:
+    """The client of the hub, which takes a second to import, and whose network's errors are those of other packages.
+
+    Raises:
+      PolicyError: it is not installed, or fails.
+    """
+    try:
+        import huggingface_hub
+
+        yield huggingface_hub
+    except Exception as error:
+        told = " ".join(str(error).split()) or repr(error)
+        raise PolicyError(f"{what} ({told}): {fix}") from error
 
 
 def compared(question: str, asked: AskedAttribute, one: TouchAnswer, two: TouchAnswer) -> ComparedTouches:

@@ -26,6 +26,7 @@ from experiments.core.commands import PROG, print_error, print_lines
 from experiments.core.errors import DataError
 from experiments.core.runner import COMPILED
 from experiments.study.policies import find_policy, is_policy, measured_figures
+from sensors_io.commands.values import require_possible
 from sensors_io.errors import UserError
 from sensors_io.records import RecordStore
 from sensors_io.remote import Mirror, at_url
@@ -226,6 +227,11 @@ AskingCommand = (
 def run_asking(arguments: Sequence[str]) -> int:
     """Run one of these commands; the exit status."""
     command = tyro.cli(AskingCommand, args=arguments, prog=PROG, config=(tyro.conf.OmitArgPrefixes,))
+    try:
+        require_possible(command)
+    except ValueError as error:
+        print_error(f"{type(error).__name__}: {error}")
+        return 2
     kept = compilations_kept(command.cache_dir / COMPILED) if arguments[0] != "export" else contextlib.nullcontext()
     try:
         with kept:

@@ -46,6 +46,10 @@ class Export:
             raise ExportError(
                 f"--fps is {self.fps}: must lie in 1 … 10,000, or 0 for that of the first contact; correct it"
             )
+        if self.records.is_dir() and self.out.resolve().is_relative_to(self.records.resolve()):
+            raise ExportError(
+                f"--out is {self.out}: lies in the folder of the records, which holds nothing else; name a path outside"
+            )
         if self.to == "ply" and self.records.suffix == ".npz":
             count = ply_of_file(self.records, self.out, self.points)
             OUT.print(f"wrote {count} surfaces to {self.out}", highlight=False)

@@ -5,11 +5,12 @@ import pathlib
 
 import tyro
 
+from sensors_io.codec import RecordsError
 from sensors_io.commands.console import OUT
 from sensors_io.contents import RESTS, rest_pictures
 from sensors_io.index import INDEX
 from sensors_io.records import RecordStore
-from sensors_io.remote import Mirror
+from sensors_io.remote import Mirror, at_url
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -25,6 +26,8 @@ class Push:
     """Such as s3://bucket/records or gs://bucket/records."""
 
     def run(self) -> int:
+        if at_url(self.records):
+            raise RecordsError(f"records are {self.records}: must be a folder on this machine; copy them there first")
         mirror, store = Mirror(self.url), RecordStore(self.records)
         rests = [f"{RESTS}/{name}" for name in rest_pictures(self.records)]
         sent = mirror.publish(self.records, [*rests, *store.files, INDEX])

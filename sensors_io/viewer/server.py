@@ -23,7 +23,6 @@ from typing import Any, ClassVar, Self
 import cv2
 import numpy as np
 
-from sensors_io.errors import UserError
 from sensors_io.viewer.page import PAGE
 from sensors_io.viewer.panels import Panel
 
@@ -169,10 +168,8 @@ class LimitedServer(http.server.ThreadingHTTPServer):
 
     request_queue_size = _CONNECTIONS
 
-    def __init__(self, address: tuple[str, int], handler: type[http.server.BaseHTTPRequestHandler]):
-        if not 0 <= address[1] < 2**16:
-            raise UserError(f"port is {address[1]}: must lie in 0..{2**16 - 1}; choose another, or 0 for a free one")
-        super().__init__(address, handler)
+    def __init__(self, *args: Any):
+        super().__init__(*args)
         self._free = threading.Semaphore(_CONNECTIONS)
 
     def process_request(self, request: Any, client_address: Any) -> None:

@@ -269,3 +269,28 @@ def test_kinds_that_are_not_installed_are_named():
 def test_a_size_of_the_cache_that_is_none_is_named(monkeypatch, size):
     monkeypatch.setenv(remote.CACHE_GB, size)
     refused(StoreError, f"TOUCHR1_CACHE_GB is '{size}': must be a number of gigabytes", lambda: Mirror("memory://x"))
+
+
+def test_a_path_of_this_machine_begins_at_its_root(records, tmp_path, monkeypatch):
+    """Whatever folder the command runs in, and with one slash, which a path makes of three."""
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    url = f"file://{tmp_path}/pushed"
+    assert main(["push", str(records), url]) == 0
+    assert (tmp_path / "pushed" / "index.json").is_file()
+    assert not list((tmp_path / "elsewhere").iterdir())
+    assert len(RecordStore(f"file:{tmp_path}/pushed")) == len(RecordStore(records))
+
+
+@pytest.mark.parametrize("url", ["reference://x", "dir://x"])
+def test_kinds_that_need_more_than_a_url_are_named(url, capsys):
+    assert main(["list", url]) == 1
+    assert f"StoreError: {url} cannot be opened" in capsys.readouterr().err
+
+
+def test_a_home_that_is_none_and_records_at_a_url_are_named(records, monkeypatch, capsys):
+    assert main(["push", "memory://a/b", "memory://c/d"]) == 1
+    assert "must be a folder on this machine" in capsys.readouterr().err
+    monkeypatch.setenv(remote.CACHE, "~nobody-of-that-name/x")
+    assert main(["list", "memory://a/b"]) == 1
+    assert "TOUCHR1_CACHE is '~nobody-of-that-name/x'" in capsys.readouterr().err

@@ -20,19 +20,24 @@ MOST_LAYERS = 1000
 """Ten times as many as large models have; each is traced by itself, so that more would seem to hang."""
 
 
+MOST_SIZE, MOST_PX = 2**20, 2**14
+"""Of a size in general, and of a picture's side; several times those of the largest models."""
+
+
 class SizeError(ValueError):
     """Sizes of a model that do not fit together; the message names them, the constraint and the fix."""
 
 
 def check_sizes(config: Any, *fields: str) -> None:
-    """Refuse a config with a size below one.
+    """Refuse a config with a size below one, or one whose prompt alone would fill the memory of any machine.
 
     Raises:
       SizeError: naming the field.
     """
     for field in fields:
-        if getattr(config, field) < 1:
-            raise SizeError(f"{field} is {getattr(config, field)}: must be at least 1; raise it")
+        most = MOST_PX if field.endswith("_px") else MOST_SIZE
+        if not 1 <= getattr(config, field) <= most:
+            raise SizeError(f"{field} is {getattr(config, field)}: must be at least 1 and at most {most:,}; change it")
 
 
 def check_layers(config: Any, least: int) -> None:

@@ -77,6 +77,9 @@ def test_depth_of_a_file_becomes_surfaces(tmp_path, capsys):
     assert "holds no depth" in capsys.readouterr().err
     assert main.main(["export", str(tmp_path), "--to", "zarr", "--points", "--out", "x"]) == 1
     assert "--points is of --to ply" in capsys.readouterr().err
+    for out in (tmp_path, tmp_path / "x", tmp_path / "a" / ".." / "b"):
+        assert main.main(["export", str(tmp_path), "--to", "hdf5", "--out", str(out)]) == 1
+        assert "lies in the folder of the records" in capsys.readouterr().err
 
 
 def test_a_rerun_recording_loads_and_has_its_entities(tmp_path, selected):

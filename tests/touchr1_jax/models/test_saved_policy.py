@@ -121,6 +121,8 @@ def sign(folder, change):
         lambda c: c["model"]["tactile"].update(width=10**400),
         lambda c: c.update(language=[]),
         lambda c: c.update(questions=None),
+        lambda c: c["model"].update(frames=10**9),
+        lambda c: c["model"]["vision"].update(image_px=2**20),
         lambda c: c["input"].update(rejected=[3]),
         lambda c: c["input"].update(rejected="SATURATED"),
         lambda c: c["input"].update(force="no"),
