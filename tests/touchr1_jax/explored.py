@@ -1,5 +1,6 @@
 """A bank of contacts and a policy that explores it, small enough that all of its trajectories can be listed."""
 
+import dataclasses
 import functools
 import itertools
 
@@ -27,9 +28,16 @@ DECODER = DecoderConfig(
     intermediate_size=32,
     mrope_section=(2, 3, 3),
 )
-POLICY: ActivePolicy = build_active_policy(
-    tuple(choice.words for choice in CHOICES), DECODER, attributes=(HARDNESS, FRICTION)
+POLICY, SHALLOW = (
+    build_active_policy(
+        tuple(choice.words for choice in CHOICES),
+        dataclasses.replace(DECODER, num_layers=layers),
+        attributes=(HARDNESS, FRICTION),
+    )
+    for layers in (2, 1)
 )
+"""The policy, and one with a single decoder layer for programs that are slow to compile."""
+
 T = POLICY.tokens(BUDGET)
 
 
@@ -64,9 +72,9 @@ def batch_of(*objects: int) -> ActiveBatch:
 
 
 @functools.cache
-def params(seed: int = 0) -> Params:
+def params(policy: ActivePolicy = POLICY) -> Params:
     """Parameters that prefer no token by much and are far from uniform."""
-    return draw_params(jax.eval_shape(lambda: POLICY.init(0, W)), seed, loud=0.3)
+    return draw_params(jax.eval_shape(lambda: policy.init(0, W)), loud=0.3)
 
 
 def trajectories() -> list[tuple[tuple[int, ...], str]]:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.touchr1_jax import tiny
+from tests.touchr1_jax.drawn import draw_params
 from touchr1_jax.models.blocked_attention import LayerCache
 from touchr1_jax.models.lm import Caches, Decoder, DecoderConfig, PrefixCache
 
@@ -23,6 +24,7 @@ def params():
     return {**tiny.params()["decoder"], "head": {"kernel": jnp.asarray(head)}}
 
 
+@jax.jit
 def prefill(params, x):
     positions = jnp.tile(jnp.arange(L), (3, 1))
     return DECODER.apply({"params": params}, x, positions, jnp.ones(L, bool), method=Decoder.prefill)
@@ -84,17 +86,19 @@ def test_a_cache_for_each_layer_reads_as_one_for_all():
     positions, mask, tokens = jnp.broadcast_to(jnp.arange(L), (3, L)), jnp.ones(L, bool), jnp.array([7, 9, 11])
     x = jnp.asarray(np.random.default_rng(3).normal(size=(L, D)), jnp.float32)
     all_of = lambda module: (module.embed(tokens), module.states(x, positions, mask))
-    params = decoder.init(jax.random.key(0), method=all_of)["params"]
-    prefix = decoder.apply({"params": params}, x, positions, mask, method=Decoder.prefill)[1]
+    shapes = jax.eval_shape(lambda key: decoder.init(key, method=all_of), jax.random.key(0))
+    params = draw_params(shapes["params"], loud=0.1)
+    run = lambda method: jax.jit(lambda *args: decoder.apply({"params": params}, *args, method=method))
+    prefix = run(Decoder.prefill)(x, positions, mask)[1]
     empty = lambda *n: LayerCache(*(jnp.zeros((*n, config.num_kv_heads, T, config.head_dim)),) * 2)
-    step = jax.jit(lambda *args: decoder.apply({"params": params}, *args, method=Decoder.decode))
+    step = run(Decoder.decode)
     found = []
     for caches in ((empty(),) * config.num_layers, (empty(before), empty())):
         for t, token in enumerate(tokens):
             hidden, caches = step(token, jnp.int32(t), prefix, caches)
         found.append((hidden, jnp.concatenate([x.k.reshape(-1, T, config.head_dim) for x in caches])))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), *found)
-    whole = decoder.apply({"params": params}, tokens, prefix, method=Decoder.extend)[-1]
+    whole = run(Decoder.extend)(tokens, prefix)[-1]
     np.testing.assert_allclose(found[0][0], whole, atol=1e-5)
 
 
@@ -118,9 +122,9 @@ def test_decoding_a_batch_writes_the_row_that_each_alone_writes(params, cache_ax
 
     fresh = filled(5.0)
     given = fresh if cache_axis is None else jax.tree.map(lambda x: jnp.stack([x, x]), fresh)
-    together = jax.jit(jax.vmap(step, (0, None, cache_axis)))(tokens, t, given)
+    one, together = jax.jit(step), jax.jit(jax.vmap(step, (0, None, cache_axis)))(tokens, t, given)
     for i, token in enumerate(tokens):
-        alone = step(token, t, fresh)
+        alone = one(token, t, fresh)
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[i], b, atol=1e-5), together, alone)
     np.testing.assert_array_equal((together[-1].k == 5).all((0, 1, 3)), np.arange(T) != 2)
     with pytest.raises(ValueError, match="do not batch t"):

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.touchr1_jax.drawn import draw_params
 from touchr1_jax.models.predictor import LatentPredictor, PredictorConfig, layer_norm
 
 P, S, T, N, D = 1, 2, 3, 2, 4
@@ -25,8 +26,7 @@ def inputs():
 def predict(inputs):
     """A predictor whose output layer says something; a fresh one copies."""
     module = LatentPredictor(CONFIG, S)
-    params = module.init(jax.random.key(0), *inputs)["params"]
-    params["out"]["kernel"] = jax.random.normal(jax.random.key(1), params["out"]["kernel"].shape)
+    params = draw_params(jax.eval_shape(module.init, jax.random.key(0), *inputs))["params"]
     return jax.jit(lambda *x: module.apply({"params": params}, *x))
 
 

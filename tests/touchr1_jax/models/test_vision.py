@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.touchr1_jax.drawn import draw_params
 from touchr1_jax.models.vision import VisionConfig, VisionTower
 
 CONFIG = dataclasses.replace(VisionConfig(), image_px=16, patch_px=4, width=8, num_layers=0)
@@ -14,7 +15,7 @@ TOWER = VisionTower(CONFIG, 12)
 
 
 def test_a_token_is_one_block_of_two_by_two_patches_row_by_row():
-    params = TOWER.init(jax.random.key(0), jnp.zeros((16, 16, 3), jnp.uint8))
+    params = draw_params(jax.eval_shape(TOWER.init, jax.random.key(0), jnp.zeros((16, 16, 3), jnp.uint8)))
     run = jax.jit(lambda x: TOWER.apply(params, x))
     view = np.random.default_rng(0).integers(0, 200, (16, 16, 3), dtype=np.uint8)
     before = run(view)
@@ -28,9 +29,10 @@ def test_a_token_is_one_block_of_two_by_two_patches_row_by_row():
 
 def test_pixels_keep_their_place_inside_a_patch():
     """A patch is rows of pixels: the embedding of one bright pixel is the kernel's row (y · 4 + x) · 3 + channel."""
-    params = TOWER.init(jax.random.key(0), jnp.zeros((16, 16, 3), jnp.uint8))["params"]
+    params = draw_params(jax.eval_shape(TOWER.init, jax.random.key(0), jnp.zeros((16, 16, 3), jnp.uint8)))["params"]
     kernel = params["patch"]["kernel"]
 
+    @jax.jit
     def patch_of(view):
         _, state = TOWER.apply(
             {"params": params}, jnp.asarray(view), capture_intermediates=lambda m, _: m.name == "patch"

@@ -9,6 +9,7 @@ import pytest
 from flax import linen as nn
 from jax.extend.core import jaxprs_in_params
 
+from tests.touchr1_jax.drawn import draw_params
 from touchr1_jax.models.layers import mrope
 from touchr1_jax.models.lm import DecoderConfig, DecoderLayer, Rematerialised
 from touchr1_jax.models.vmappable_dense import Dense, Embed, linear, linear_p
@@ -80,7 +81,8 @@ def test_rematerialised_layers_multiply_with_no_weight_twice():
     found = []
     for kind in (DecoderLayer, Rematerialised, nothing):
         layer = kind(DECODER)
-        params = layer.init(jax.random.key(0), x, rotation, mask, method="over_prompt")
+        init = lambda key, layer=layer: layer.init(key, x, rotation, mask, method="over_prompt")
+        params = draw_params(jax.eval_shape(init, jax.random.key(0)))
         cost = lambda p, layer=layer: jnp.sum(layer.apply(p, x, rotation, mask, method="over_prompt")[0] ** 2)
         found.append(products(jax.make_jaxpr(jax.grad(cost))(params).jaxpr))
     assert found[0] == found[1] < found[2]

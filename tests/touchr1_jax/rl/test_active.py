@@ -9,7 +9,7 @@ import optax
 import pytest
 
 from tests.touchr1_jax import explored
-from tests.touchr1_jax.explored import BANK, BUDGET, POLICY, N, T
+from tests.touchr1_jax.explored import BANK, BUDGET, POLICY, SHALLOW, N, T
 from touchr1_jax.models.active_policy import Explored
 from touchr1_jax.models.policy import Policy
 from touchr1_jax.rl.active import (
@@ -136,11 +136,12 @@ STEP = GRPOConfig(prompts=4, group=4, length=T, micro_prompts=2, algorithm=Paper
 
 def test_one_program_serves_all_prices_and_batches():
     optimizer = optax.sgd(1e-3)
-    step = make_active_step(POLICY.constrained_fns, optimizer, STEP, BUDGET)
-    state = start_state(explored.params(), optimizer, jax.random.key(0), STEP)
+    step = make_active_step(SHALLOW.constrained_fns, optimizer, STEP, BUDGET)
+    start = explored.params(SHALLOW)
+    state = start_state(start, optimizer, jax.random.key(0), STEP)
     bank = jax.tree.map(jnp.asarray, BANK)
     for price, objects in ((0.0, (0, 1, 2, 3)), (0.5, (3, 2, 1, 0))):
-        inputs = ActiveInputs(explored.params(), bank, Prices(jnp.float32(price), jnp.float32(price)))
+        inputs = ActiveInputs(start, bank, Prices(jnp.float32(price), jnp.float32(price)))
         state, metrics = step(state, explored.batch_of(*objects), inputs)
         np.testing.assert_allclose(metrics["reward_seconds"], -price * metrics["seconds"], rtol=1e-5)
         assert metrics["sampler_gap_peak"] < 1e-5
@@ -153,9 +154,9 @@ def test_answers_are_enumerated_with_the_price_of_their_touches():
     """Each level earns what a trajectory with that answer does."""
     algorithm = Paper(constrained=True, gamma=0.0, beta=0.0, enumerated=Norm.NONE, learn_conclusion=False)
     config = dataclasses.replace(STEP, algorithm=algorithm)
-    fns, optimizer, bank = POLICY.constrained_fns, optax.sgd(1e-3), jax.tree.map(jnp.asarray, BANK)
+    fns, optimizer, bank = SHALLOW.constrained_fns, optax.sgd(1e-3), jax.tree.map(jnp.asarray, BANK)
     engine = ActiveEngine(fns, priced_answer, optimizer, config, None, lambda p: p, fns.levels, False, BUDGET)
-    inputs, batch = ActiveInputs(explored.params(), bank, PRICES), explored.batch_of(0, 1, 2, 3)
+    inputs, batch = ActiveInputs(explored.params(SHALLOW), bank, PRICES), explored.batch_of(0, 1, 2, 3)
     key = jax.random.key(0)
     group, metrics = jax.jit(lambda: engine.rollouts(inputs.reference, batch, inputs, key, key))()
     label = BANK.label[np.arange(4), np.arange(4) % 2]

@@ -6,15 +6,19 @@ import numpy as np
 import pytest
 
 from tests.touchr1_jax import tiny
-from touchr1_jax.rl.counterfactual import (
-    drop_touch,
-    mask_one_stream,
-    noise_touch,
-    shuffle_touch,
-    swap_touch,
-)
+from touchr1_jax.rl import counterfactual
 
-P, STEPS = 5, 2
+drop_touch, noise_touch, shuffle_touch, swap_touch, mask_one_stream = map(
+    jax.jit,
+    (
+        counterfactual.drop_touch,
+        counterfactual.noise_touch,
+        counterfactual.shuffle_touch,
+        counterfactual.swap_touch,
+        counterfactual.mask_one_stream,
+    ),
+)
+P = 5
 NOISE = jnp.asarray(
     np.random.default_rng(0).normal(size=(7, tiny.S, tiny.N, tiny.CONFIG.decoder.hidden_size)), jnp.float32
 )

@@ -123,9 +123,8 @@ def test_mean_gradient_over_all_groups_is_that_of_the_expected_reward(algorithm)
     """
     config = GRPOConfig(prompts=1, micro_prompts=1, group=2, length=2, algorithm=algorithm)
 
-    def loss(trace_logits, level_logits, pair):
+    def loss(trace_logits, level_logits, drawn):
         log_trace, log_level = jax.nn.log_softmax(trace_logits), jax.nn.log_softmax(level_logits)
-        drawn = jnp.array(pair)
         log_prob = jnp.stack([log_trace[drawn], log_level[drawn, 0]], -1)[None]
         nothing = jnp.zeros_like(log_prob)
         kl = jnp.sum(jnp.exp(log_level) * (log_level - jnp.log(REFERENCE)), -1)[drawn]
@@ -136,11 +135,11 @@ def test_mean_gradient_over_all_groups_is_that_of_the_expected_reward(algorithm)
         mask, a, w = jnp.ones(old.shape, bool), jnp.full((1, 2), jnp.nan), jnp.ones(1)
         return grpo_loss(found, old, old, mask, a, w, config, levels=levels)[0]
 
-    grad = jax.grad(loss, argnums=(0, 1))
+    grad = jax.jit(jax.grad(loss, argnums=(0, 1)))
     total = [np.zeros(2), np.zeros((2, 3))]
     for pair in itertools.product(range(2), repeat=2):
         chance = np.prod(softmax(TRACE)[list(pair)])
-        for sum_, g in zip(total, grad(jnp.asarray(TRACE), jnp.asarray(LEVEL), pair), strict=True):
+        for sum_, g in zip(total, grad(TRACE, LEVEL, np.array(pair)), strict=True):
             sum_ -= config.length * chance * np.asarray(g, float)
     of_trace, of_level = true_gradient()
     of_level = of_level if algorithm.learn_conclusion else gradient_to_reference()
@@ -174,7 +173,8 @@ def rewards():
     each = jax.vmap(jax.vmap(worth, in_axes=(0, None), axis_name="group"))
     reward_of = lambda tokens, level: each(tokens, target)[0]
     both = jnp.stack([tokens, tokens])
-    return level_rewards(reward_of, LEVELS, both, target, jnp.full((2, 2), 0.25), jnp.ones(2, bool))
+    sampled, counts = jnp.full((2, 2), 0.25), jnp.ones(2, bool)
+    return jax.jit(lambda both: level_rewards(reward_of, LEVELS, both, target, sampled, counts))(both)
 
 
 def test_rewards_of_every_conclusion_by_hand(rewards):
