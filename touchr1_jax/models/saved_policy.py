@@ -124,6 +124,7 @@ def published(folder: Path) -> Iterator[Path]:
 
     Until the new one is in place the old one stays, or is put back.
     """
+    folder = folder.resolve()  # "." has no name to put another beside, and what a link leads to is replaced, not it
     unfinished, old = (folder.with_name(f".{folder.name}.{os.getpid()}{end}") for end in ("", ".old"))
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)

@@ -19,7 +19,14 @@ PREFIX = "base_model.model."
 FACTORS = {"a": "lora_A", "b": "lora_B"}
 """Our factors, [in, r] and [r, out], and PEFT's, which are turned."""
 
-REFUSED = {"bias": "none", "use_dora": False, "fan_in_fan_out": False, "modules_to_save": None, "rank_pattern": {}}
+REFUSED = {
+    "bias": "none",
+    "use_dora": False,
+    "fan_in_fan_out": False,
+    "modules_to_save": None,
+    "rank_pattern": {},
+    "alpha_pattern": {},
+}
 """Fields of a config and the values without which adapters compute something else than here."""
 
 
