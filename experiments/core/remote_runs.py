@@ -5,6 +5,7 @@ A store can neither lock nor append to a file, so one machine at a time may comp
 
 import contextlib
 import logging
+import os
 import shutil
 import tempfile
 import threading
@@ -13,6 +14,7 @@ from pathlib import Path
 
 from experiments.core.commands import print_error, print_lines
 from sensors_io.remote import Mirror, StoreError
+from touchr1_jax.training.checkpoint import CHECKSUMS
 
 EVERY_S = 60.0
 """Between two copies: what a machine computed in the last minute before it is lost is computed again."""
@@ -40,7 +42,7 @@ def run_at(url: str, name: str, execute: Callable[[Path], int]) -> int:
     copying.start()
     try:
         code = execute(runs_dir)
-    finally:
+    finally:  # also what a run left that ended by an error of the code
         ended.set()
         copying.join()
         copied = copier.finish()
@@ -55,33 +57,44 @@ class _Copier:
         self._sent = dict[str, tuple[int, int]]()
 
     def fetch(self) -> None:
-        """Take the unfinished runs of the URL."""
+        """Take the unfinished runs of the URL.
+
+        A checkpoint whose copy broke off lacks its checksums, which are sent last, and is left out.
+        """
         files = self._remote.files()
         finished = {name.partition("/")[0] for name in files if name.partition("/")[2] == RESULTS}
+        signed = tuple(name.removesuffix(CHECKSUMS) for name in files if name.endswith(f"/{CHECKSUMS}"))
         for name in files:
-            if name.partition("/")[0] not in finished:
+            run, _, inside = name.partition("/")
+            whole = not inside.startswith("checkpoints/") or name.startswith(signed)
+            if run not in finished and whole:
                 (path := self._folder / name).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(self._remote.fetch(name), path)
         self._sent = {name: _state(path) for name, path in self._files().items()}
 
     def copy_until(self, ended: threading.Event) -> None:
-        """Copy every `EVERY_S` seconds; a store that fails is tried again the next time."""
+        """Copy every `EVERY_S` seconds; a store or a disk that fails is tried again the next time."""
         while not ended.wait(EVERY_S):
-            try:
-                self.copy()
-            except (StoreError, OSError) as error:  # a checkpoint may be removed while its folder is read
+            if (error := self.failure()) is not None:
                 _LOG.warning("%s: the run goes on, and is copied in %g s", error, EVERY_S)
 
     def finish(self) -> bool:
-        """Copy the end of a run and remove it here; false, with a line, if the store does not take it."""
-        try:
-            self.copy()
-        except StoreError as error:
-            print_error(f"StoreError: {error}\nThe run is in {self._folder}: copy it to {self._remote} yourself")
+        """Copy the end of a run and remove it here; false, with a line, if it cannot be copied."""
+        if (error := self.failure()) is not None:
+            kept = f"The run is in {self._folder}: copy it to {self._remote} yourself"
+            print_error(f"{type(error).__name__}: {error}\n{kept}")
             return False
         shutil.rmtree(self._folder.parent)
         print_lines(f"the run is at {self._remote}")
         return True
+
+    def failure(self) -> Exception | None:
+        """Copy what changed; the error that prevented it, if any."""
+        try:
+            self.copy()
+        except (StoreError, OSError) as error:
+            return error
+        return None
 
     def copy(self) -> None:
         """Copy what changed.
@@ -94,7 +107,7 @@ class _Copier:
         changed = sorted((name for name in files if self._sent.get(name) != states[name]), key=lambda n: not _whole(n))
         with tempfile.TemporaryDirectory(dir=self._folder.parent) as snapshot:
             kept = [name for name in changed if _keep(files[name], Path(snapshot, name))]
-            rank = lambda name: 2 if name.split("/")[1] == RESULTS else _whole(name)
+            rank = lambda name: (name.split("/")[1] == RESULTS, name.endswith(f"/{CHECKSUMS}"), _whole(name))
             self._remote.publish(Path(snapshot), sorted(kept, key=rank))
         self._sent |= {name: states[name] for name in kept}
 
@@ -102,7 +115,8 @@ class _Copier:
         """The files of all runs, without locks, the link to the latest run and what is half-written."""
         found = dict[str, Path]()
         for run in (path for path in self._folder.glob("*") if not path.is_symlink()):
-            for path in run.rglob("*"):
+            # `rglob` fails where a folder is renamed or removed meanwhile, as those of checkpoints are
+            for path in (Path(folder, file) for folder, _, files in os.walk(run) for file in files):
                 name = path.relative_to(self._folder).as_posix()
                 if path.is_file() and not any(part[0] == "." or _HALF in part for part in name.split("/")):
                     found[name] = path

@@ -147,9 +147,13 @@ class _Run:
     gel: SourceGel
     notes: dict[str, list[dict[str, str]]]
     unread: list[Skip] = dataclasses.field(default_factory=list)
+    named: dict[ContactKey, str] = dataclasses.field(default_factory=dict)
 
     def add(self, n: int, listed: Listed) -> None:
         """Import contact n of the catalogue if it is not there yet, or note why not."""
+        if (first := self.named.setdefault(listed.key, listed.name)) != listed.name:
+            self.unread.append(Skip(name=listed.name, reason=f"has the object, site and trial of {first}"))
+            return
         if listed.key in self.writer:
             return
         try:

@@ -117,7 +117,7 @@ def _rows(source: pathlib.Path, tables: list[pathlib.Path]) -> tuple[list[_Readi
             if not cells["tactile"].strip() and _force(cells["FT"]) is None:
                 skipped.append(Skip(name=f"{table.name}, line {line}", reason=NO_ROW))
                 continue
-            if not name.stem.isdecimal() or len(name.parts) < 3 or ".." in name.parts:
+            if not name.stem.isdecimal() or len(name.parts) < 3 or name.is_absolute() or ".." in name.parts:
                 reason = "names no <indenter>/tactile/<ms>.png"
                 skipped.append(Skip(name=f"{table.name}, line {line}", reason=reason))
                 continue

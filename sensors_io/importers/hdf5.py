@@ -155,9 +155,10 @@ def _stated(file: Any, place: Place, of: ValueMap, name: str) -> Any:
     else:
         found = dataset(file, place.group, of.value, name)[()]
     found = np.asarray(found)
-    chosen = found.ravel()[place.row if found.size > 1 else 0] if found.size > place.row else None
-    if chosen is None:
+    row = place.row if found.size > 1 else 0  # one value is that of all rows
+    if found.size <= row:
         raise HDF5Error(f"{of.value} of {name} has no value for row {place.row}")
+    chosen = found.ravel()[row]
     return chosen.decode(errors="replace") if isinstance(chosen, bytes) else chosen
 
 

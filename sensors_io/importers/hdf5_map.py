@@ -224,6 +224,12 @@ def _stream(entry: _Entry) -> StreamMap:
     rate = entry.found.get("rate_hz")
     if not {"frames", "depth_mm", "deformation_mm"} & arrays.keys():
         raise ImportSourceError(f"{entry.name} has no frames, depth_mm or deformation_mm: needs one of them; add it")
+    clock = arrays.get("host_time_ns")
+    if clock is not None and (clock.optional or clock.time is not None):
+        raise ImportSourceError(
+            f"{entry.name}: host_time_ns is the clock of the frames: must be there, without a time of its own; leave "
+            "`optional` and `time` out"
+        )
     if "host_time_ns" in arrays and rate is None:
         return StreamMap(arrays=arrays, rate_hz=None)
     stated = isinstance(rate, (int, float)) and not isinstance(rate, bool) and LEAST_HZ <= rate <= MOST_HZ

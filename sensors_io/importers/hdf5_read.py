@@ -96,15 +96,16 @@ def bounds(file: Any, group: str, rows: RowsMap) -> np.ndarray:
     Raises:
       HDF5Error: they are no ascending whole numbers.
     """
-    found = dataset(file, group, rows.path, rows.kind)[()]
-    ends = np.append(0, np.cumsum(found)) if rows.kind == "lengths" else np.asarray(found)
-    whole = np.issubdtype(ends.dtype, np.integer) and ends.ndim == 1 and len(ends) > 1
-    if not whole or (ends.astype(np.int64) < 0).any() or (np.diff(ends.astype(np.int64)) < 0).any():  # or beyond 2⁶³
+    found = np.asarray(dataset(file, group, rows.path, rows.kind)[()])
+    whole = np.issubdtype(found.dtype, np.integer) and found.ndim == 1
+    ends = found.astype(np.int64) if whole else np.zeros(1, np.int64)
+    ends = np.append(0, np.cumsum(ends)) if whole and rows.kind == "lengths" else ends
+    if len(ends) < 2 or ends[0] < 0 or (np.diff(ends) < 0).any():
         must = (
             "lengths of all contacts" if rows.kind == "lengths" else "first rows of all contacts and the last one's end"
         )
         raise HDF5Error(f"{rows.path} must hold the {must}, whole numbers ≥ 0, the rows ascending")
-    return ends.astype(np.int64)
+    return ends
 
 
 def dataset(file: Any, group: str, path: str, what: str) -> Any:
@@ -246,7 +247,9 @@ class _Rows:
         array = self.array
         units = next(known for known in UNITS.values() if array.unit in known and known[array.unit] == array.factor)
         for name in STATED:
-            said = self.data.attrs.get(name, "")
+            if name not in self.data.attrs:
+                continue
+            said = self.data.attrs[name]
             said = said.decode(errors="replace") if isinstance(said, bytes) else str(said)
             unit = SPELLED.get(said.strip().lower(), said.strip())
             if unit in units and units[unit] != array.factor:

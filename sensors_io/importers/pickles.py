@@ -71,7 +71,7 @@ def _array(data: Any, kind: Any, shape: Any, order: Any) -> np.ndarray:
         flat = np.empty(len(data), object)
         for i, item in enumerate(data):
             flat[i] = item
-        return flat.reshape(shape, order=order)
+        return flat.reshape(shape)  # NumPy lists objects row by row in either order
     size = math.prod(shape) * kind.dtype.itemsize
     if not isinstance(data, bytes | bytearray) or len(data) != size:
         raise PickleError(f"an array of {kind.dtype}{list(shape)} must have {size} bytes")

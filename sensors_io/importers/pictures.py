@@ -142,6 +142,17 @@ def film(key: ContactKey, sensor: str, *, gap: np.ndarray, host_time_ns: np.ndar
     )
 
 
+def stored_ns(seconds: np.ndarray, file: str) -> np.ndarray:
+    """Stored times, int64 [N].
+
+    Raises:
+      UnreadableError: they are not finite, or run backwards.
+    """
+    if not np.isfinite(seconds).all() or (np.diff(seconds) < 0).any():
+        raise UnreadableError(f"{file} has times that are not finite, or run backwards")
+    return np.rint(seconds * 1e9).astype(np.int64)
+
+
 def nominal_ns(frame: np.ndarray, rate_hz: float) -> np.ndarray:
     """Times of frame numbers at a stated rate, int64 [N]."""
     return np.rint(np.asarray(frame, np.float64) * (1e9 / rate_hz)).astype(np.int64)

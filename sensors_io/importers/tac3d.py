@@ -68,14 +68,15 @@ def list_tac3d(source: pathlib.Path, config: Shares) -> Catalogue:
 
 def _read(path: pathlib.Path, key: ContactKey) -> Taken:
     arrays = _load(path)
-    kept = np.all([np.isfinite(arrays[name]).reshape(len(arrays["index"]), -1).all(1) for name in _SHAPES], axis=0)
+    kept = np.all([np.isfinite(array).reshape(len(array), -1).all(1) for array in arrays.values()], axis=0)
     lost = [
         Skip(name=f"{path.name}, frame {n}", reason="holds values that are not finite") for n in np.flatnonzero(~kept)
     ]
     if not kept.any():
         raise RecordingError("holds no frame of finite values")
     arrays = {name: array[kept] for name, array in arrays.items()}
-    steps = np.diff(arrays["index"].astype(np.int64), prepend=arrays["index"][0] - 1)
+    index = arrays["index"].astype(np.int64)
+    steps = np.diff(index, prepend=index[0] - 1)
     sent_ns = _ns(arrays["sendTimestamp"])
     host_ns = _ns(arrays["recvTimestamp"]) if "recvTimestamp" in arrays else sent_ns
     if (np.diff(host_ns) < 0).any():
@@ -110,9 +111,10 @@ def _load(path: pathlib.Path) -> dict[str, np.ndarray]:
     if missing:
         raise RecordingError(f"lacks {', '.join(missing)}")
     count = len(arrays["index"])
-    for name, shape in _SHAPES.items():
-        if arrays[name].shape != (count, *shape):
-            raise RecordingError(f"{name} has shape {arrays[name].shape}: must be {(count, *shape)}")
+    for name, array in arrays.items():
+        shape = _SHAPES.get(name, ())
+        if array.shape != (count, *shape):
+            raise RecordingError(f"{name} has shape {array.shape}: must be {(count, *shape)}")
     if not count:
         raise RecordingError("holds no frame")
     rest = _grid(arrays["3D_Positions"] - arrays["3D_Displacements"])[0]

@@ -24,7 +24,7 @@ from sensors_io.arrays import load_arrays
 from sensors_io.importers.catalogue import Catalogue, Listed, Taken, fingerprint, require_files
 from sensors_io.importers.holdout import split_by_name
 from sensors_io.importers.keep import ImportConfig, ImportSourceError, Skip, UnreadableError
-from sensors_io.importers.pictures import film, nominal_ns, read_pictures
+from sensors_io.importers.pictures import film, nominal_ns, read_pictures, stored_ns
 from sensors_io.importers.tables import read_rows
 from sensors_io.schema import MATERIALS, ContactKey, ObjectCard
 
@@ -172,4 +172,4 @@ def _times(folder: pathlib.Path, numbers: np.ndarray) -> tuple[np.ndarray, str]:
         raise UnreadableError(f"time2.npy is damaged ({error})") from error
     if numbers[-1] >= len(seconds):
         raise UnreadableError(f"time2.npy has {len(seconds)} times and frame {numbers[-1]} is listed")
-    return np.rint((seconds[numbers] - seconds[0]) * 1e9).astype(np.int64), "time2.npy"
+    return stored_ns(seconds[numbers] - seconds[0], path.name), "time2.npy"

@@ -78,7 +78,13 @@ def _trajectories(source: pathlib.Path, tables: list[pathlib.Path]) -> tuple[dic
     for table in tables:
         for row in read_table(table, COLUMNS):
             tactile, vision = pathlib.PurePosixPath(row["tactile"]), pathlib.PurePosixPath(row["url"])
-            strays = len(tactile.parts) != 3 or len(vision.parts) != 3 or ".." in (*tactile.parts, *vision.parts)
+            strays = (
+                tactile.is_absolute()
+                or vision.is_absolute()
+                or len(tactile.parts) != 3
+                or len(vision.parts) != 3
+                or ".." in (*tactile.parts, *vision.parts)
+            )
             if strays or not tactile.name[0].isdecimal():
                 reason = "is no <trajectory>/{tactile,vision}/<i>-<gap>.jpg"
                 skipped.append(Skip(name=f"{table.parent.name}/{table.name}: {row['tactile']}", reason=reason))

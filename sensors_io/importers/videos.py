@@ -79,7 +79,10 @@ def list_videos(source: pathlib.Path, config: VideosConfig) -> Catalogue:
     for clip in named:
         for known in {clip, _plain(clip)}:
             by_name.setdefault(known, []).append(clip)
-    row_of = {_find(name, row, by_name, source): row for name, row in rows.items()}
+    row_of: dict[str, LabelRow] = {}
+    for name, row in rows.items():
+        if row_of.setdefault(found := _find(name, row, by_name, source), row) is not row:
+            raise LabelsError(f"{row.place}: {CLIP} {name!r} is {found}, as in {row_of[found].place}; keep one line")
     cards = _cards(row_of, list(named), config)
     contacts, trials = [], Counter[str]()
     for name, path in named.items():

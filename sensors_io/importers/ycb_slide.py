@@ -17,7 +17,7 @@ import numpy as np
 from sensors_io.importers.catalogue import Catalogue, Listed, Taken, bare_catalogue, require_files
 from sensors_io.importers.keep import ImportConfig, Skip, UnreadableError
 from sensors_io.importers.pickles import PickleError, read_pickle
-from sensors_io.importers.pictures import film, natural, nominal_ns, numbered, read_pictures
+from sensors_io.importers.pictures import film, natural, nominal_ns, numbered, read_pictures, stored_ns
 from sensors_io.schema import ContactKey
 
 SENSOR = "digit"
@@ -90,13 +90,16 @@ def _times(slide: pathlib.Path, count: int) -> np.ndarray:
 
     Raises:
       PickleError: neither file can be read.
-      UnreadableError: there are not as many times as frames.
+      UnreadableError: they are not one finite time for each frame, in order.
     """
     found = next((slide / name for name in TIMES if (slide / name).is_file()), slide / TIMES[0])
     data = read_pickle(found)
     if not isinstance(data, dict) or "timestamps" not in data:
         raise PickleError(f"{found.name} has no timestamps")
-    seconds = np.asarray(data["timestamps"], np.float64)
+    try:
+        seconds = np.asarray(data["timestamps"], np.float64)
+    except (TypeError, ValueError) as error:
+        raise UnreadableError(f"{found.name} holds no numbers ({error})") from error
     if seconds.shape != (count,):
         raise UnreadableError(f"{found.name} has times for {seconds.size} frames, the folder has {count}")
-    return np.rint(seconds * 1e9).astype(np.int64)
+    return stored_ns(seconds, found.name)

@@ -1,5 +1,8 @@
 """A run at a URL goes on from any copy of it, on any machine."""
 
+import pathlib
+import shutil
+
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
@@ -75,6 +78,52 @@ def test_a_copy_that_breaks_off_has_the_log_of_each_stage_and_no_results_without
         map(order.index, ("stages/one", "checkpoints/sft/5/x"))
     )
     assert order[-1] == "results.json"
+
+
+def test_a_checkpoint_whose_copy_broke_off_is_not_taken(sent, url):
+    def begin(runs_dir):
+        write(runs_dir / "toy", metrics="a\n", **{"checkpoints__sft__5__checksums.json": "{}"})
+        write(runs_dir / "toy", checkpoints__sft__5__x="1", checkpoints__sft__9__x="half")
+        return 130
+
+    found = []
+
+    def go_on(runs_dir):
+        found.extend(p.relative_to(runs_dir / "toy" / RUN).as_posix() for p in runs_dir.rglob("*") if p.is_file())
+        return 130
+
+    assert [run_at(url, "toy", each) for each in (begin, go_on)] == [130, 130]
+    assert sent[-1] == f"{RUN}/checkpoints/sft/5/checksums.json"
+    assert sorted(found) == ["checkpoints/sft/5/checksums.json", "checkpoints/sft/5/x", "metrics"]
+
+
+def test_a_checkpoint_that_vanishes_while_files_are_listed_ends_no_copy(sent, url, monkeypatch):
+    is_file, folders = pathlib.Path.is_file, []
+
+    def execute(runs_dir):
+        write(runs_dir / "toy", a="1", checkpoints__sft__5__x="1", checkpoints__sft__10__x="1", metrics="a\n")
+        folders.append(runs_dir / "toy" / RUN / "checkpoints" / "sft")
+        return 0
+
+    def removing(path):
+        for folder in folders if RUN in str(path) else ():
+            shutil.rmtree(folder / "5", ignore_errors=True)
+            shutil.rmtree(folder / "10", ignore_errors=True)
+        return is_file(path)
+
+    monkeypatch.setattr(pathlib.Path, "is_file", removing)
+    assert run_at(url, "toy", execute) == 0
+    assert sorted(sent) == [f"{RUN}/a", f"{RUN}/metrics"]
+
+
+def test_what_an_error_of_the_code_leaves_is_copied_too(sent, url):
+    def execute(runs_dir):
+        write(runs_dir / "toy", config="{}")
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        run_at(url, "toy", execute)
+    assert sent == [f"{RUN}/config"]
 
 
 def test_a_run_that_the_store_does_not_take_stays_on_this_machine(sent, url, monkeypatch, capsys):

@@ -55,8 +55,10 @@ def test_rows_without_a_force_or_a_picture_are_counted(tmp_path):
     readings = {1000: "0 0 -3 0 0 0", 2000: "", 3000: "0 0 -3 0 0", 4000: "0 0 nan 0 0 0", 5000: "0 0 -3 0 0 0"}
     rows = [row(root, ms, reading, write=ms not in (2000, 5000)) for ms, reading in readings.items()]
     rows += ["records/sphere/tactile/background.png,,0 0 0 0 0 0\n", row(root, 6000, "0 0 -2 0 0 0")]
+    picture(elsewhere := tmp_path / "sphere" / "tactile" / "7000.png", 0)
+    rows.append(f"{elsewhere},,0 0 -2 0 0 0\n")
     report, store = feel(write(root, *rows), tmp_path / "out")
-    lines = {f"20250414.csv, line {n}" for n in (3, 4, 5, 7)}
+    lines = {f"20250414.csv, line {n}" for n in (3, 4, 5, 7, 9)}
     assert {skip.name for skip in report.skipped} == {*lines, "tactile/5000.png"}
     sequence = store.contact(0)["gelsight_mini"]
     assert sequence.force_n[:, 2].tolist() == [-3, 0, 0, -2]

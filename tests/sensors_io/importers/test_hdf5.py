@@ -61,6 +61,20 @@ def imported(folder, layout, **config):
     return [tuple(store.contact(i).values()) for i in range(len(store))], report
 
 
+def test_rows_by_unsigned_lengths_share_one_value_and_pictures_in_0_to_1_need_no_stated_unit(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["rgb"], file["rows"], file["hardness"] = RGB / 255.0, np.array([2, 4], np.uint32), 1.5
+        file.attrs["object"] = "mug"
+    frames = {"path": "/rgb", "unit": "1", "rows": {"lengths": "/rows"}}
+    layout = {"object_id": {"attribute": "object"}, "sensors": {"gelsight_mini": {"frames": frames, "rate_hz": 30}}}
+    contacts, report = imported(tmp_path, layout)
+    assert report.skipped == ()
+    np.testing.assert_array_equal(np.concatenate([sequence.frames for (sequence,) in contacts]), RGB)
+    labelled = layout | {"labels": {"hardness": {"path": "/hardness"}}}
+    (skip,) = list_hdf5(tmp_path, HDF5Config(map=write_map(tmp_path, labelled))).skipped
+    assert "hardness is " in skip.reason  # 1.5 is no level
+
+
 def test_groups_by_trial_with_force_of_another_rate(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for n, name in enumerate(("mug", "cup", "mug")):
@@ -214,6 +228,7 @@ def test_an_optional_array_may_be_missing_and_a_cut_file_is_named(tmp_path):
         ({"mini": {"force_n": {"path": "f", "unit": "N", "components": ["x", "x", "z"]}}}, "must name x, y, z once"),
         ({"mini": {"frames": {"path": "f", "components": ["-r", "g", "b"]}}}, "colours have no sign"),
         ({"mini": {"host_time_ns": None}}, "rate_hz is None"),
+        ({"mini": {"host_time_ns": {"path": "t", "unit": "s", "optional": True}}}, "leave `optional` and `time` out"),
         ({"mini": {"frames": None, "depth_mm": None}}, "needs one of them"),
         ({"object_id": {"attribute": "a", "path": "b"}}, "must hold one of attribute, path, value"),
         ({"mini": {"frames": {"path": 3}}}, "path is 3: must be a text"),

@@ -84,4 +84,6 @@ def test_arrays_of_every_order_and_type_come_back(tmp_path):
         *found, empty, objects = read_pickle(tmp_path / "a.pkl")
         np.testing.assert_equal(found, data)
         assert (empty.shape, objects.shape, objects[1]) == ((0,), (2,), None)
+        (tmp_path / "a.pkl").write_bytes(pickle.dumps(np.array([[1, 2], [3, None]], object, order="F"), protocol))
+        assert read_pickle(tmp_path / "a.pkl").tolist() == [[1, 2], [3, None]]
         np.testing.assert_array_equal(objects[0]["a"], [0, 1])

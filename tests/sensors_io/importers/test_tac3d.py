@@ -75,6 +75,7 @@ def test_gaps_of_the_counter_are_flagged_and_counted(tmp_path):
         ({"3D_ResultantMoment": None}, "lacks 3D_ResultantMoment"),
         ({"3D_Positions": np.zeros((3, 400, 2))}, r"3D_Positions has shape \(3, 400, 2\): must be \(3, 400, 3\)"),
         ({"3D_Positions": recording()["3D_Positions"][:, ::-1]}, "points in another order"),
+        ({"recvTimestamp": np.arange(2.0)}, r"recvTimestamp has shape \(2,\): must be \(3,\)"),
         ({"3D_ResultantForce": np.full((3, 1, 3), np.inf)}, "no frame of finite values"),
     ],
 )
@@ -97,6 +98,9 @@ def test_receive_times_are_host_times_where_they_are_stored(tmp_path):
 def test_a_frame_that_is_not_finite_is_left_out(tmp_path):
     arrays = recording()
     arrays["3D_ResultantForce"][1, 0, 2] = np.nan
+    received = np.array([0.1, 0.2, np.nan])
+    report, store = read(write(tmp_path / "in", **arrays, recvTimestamp=received), tmp_path / "more")
+    assert [skip.name[-7:] for skip in report.skipped] == ["frame 1", "frame 2"]
     report, store = read(write(tmp_path / "in", **arrays), tmp_path / "out")
     assert [skip.name for skip in report.skipped] == ["example_1_AD2-0065L.npz, frame 1"]
     assert store.contact(0)["tac3d"].flags.tolist() == [0, int(Flag.TIME_GAP)]

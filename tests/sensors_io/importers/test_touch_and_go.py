@@ -72,3 +72,6 @@ def test_recorded_times_are_used_where_they_are(source, tmp_path):
     np.testing.assert_allclose(sequence.host_time_ns, [250_000_000, 360_000_000, 490_000_000], atol=100)
     assert sequence.camera["clock"] == "time2.npy"
     assert "time2.npy has 2 times and frame 2 is listed" in {skip.reason for skip in report.skipped}
+    np.save(source / "dataset" / SECOND / "time2.npy", np.array([0.0, 0.1, np.nan]))
+    report, _ = imported(list_touch_and_go(source, EVERYTHING), tmp_path / "again")
+    assert "time2.npy has times that are not finite, or run backwards" in {skip.reason for skip in report.skipped}

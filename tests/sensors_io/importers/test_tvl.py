@@ -27,6 +27,12 @@ def source(tmp_path):
     return tmp_path / "hct"
 
 
+def test_a_path_from_the_root_on_is_left_out(source):
+    (source / "data1" / "test.csv").write_text(HEAD + "/vision/1-2.jpg,/tactile/1-2.jpg,,\n")
+    catalogue = list_tvl(source, EVERYTHING)
+    assert [skip.name for skip in catalogue.skipped] == ["data1/test.csv: /tactile/1-2.jpg"]
+
+
 def test_trajectories_become_records(source, tmp_path):
     report, store = imported(list_tvl(source, EVERYTHING), tmp_path / "out")
     assert (report.contacts, report.skipped, len(report.unannotated)) == (2, (), 4)

@@ -65,6 +65,7 @@ def test_clips_become_records_with_the_labels_of_their_table(clips, tmp_path):
         ("other,a b,1,,,", r"line 7: .*object_id"),
         ("other,x", r"line 7: must have 6 cells; complete it"),
         ("mug/1.avi,x,,,,", r"line 7: clip 'mug/1.avi' appears twice"),
+        ("mug/1,x,,,,", r"line 7: clip 'mug/1' is mug/1.avi, as in .*keep one line"),
     ],
 )
 def test_what_does_not_fit_is_named_by_file_and_line(clips, row, said):

@@ -38,7 +38,9 @@ def test_damage_is_left_out_by_name(tmp_path):
     cut(slide(source, 0, 3, times=range(3)) / "frames" / "frame_0000001.jpg")
     slide(source, 1, 3, times=range(9))
     (source / DRILL / "dataset_2").mkdir()
+    slide(source, 3, 3, times=(0.0, np.nan, 0.2))
+    slide(source, 4, 2, times=("a", "b"))
     report, store = imported(list_ycb_slide(source, KEEP), tmp_path / "out")
     names = {skip.name.removeprefix(f"{DRILL}/") for skip in report.skipped}
-    assert names == {"dataset_0/frames/frame_0000001.jpg", "dataset_1 0", "dataset_2"}
+    assert names == {"dataset_0/frames/frame_0000001.jpg", "dataset_1 0", "dataset_2", "dataset_3 0", "dataset_4 0"}
     assert store.contact(0)["digit"].flags.tolist() == [0, int(Flag.TIME_GAP)]
