@@ -1,5 +1,7 @@
 """The height of an object's skin under a sensor, in JAX, exactly translatable and rotatable."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -52,24 +54,22 @@ class SensorPose:
     tilt: Float[Array, "2"]
 
 
-def as_f32(value: float | np.ndarray) -> np.ndarray:
-    """A number or an array for a compiled program, whose call takes it to the device.
-
-    One by one with `jax.numpy`, that takes 15 % of the time of a small scene.
-    """
+def as_f32(value: float | np.ndarray) -> Any:
+    """A NumPy array in the place of a JAX array; the call of a compiled program takes all of them to the device."""
     return np.asarray(value, np.float32)
 
 
 def make_skin(solid: Solid, site_mm: np.ndarray, curvature_factor: float) -> Skin:
     """Skin of an object at a site; the body is more or less curved there by `curvature_factor`."""
 
+    pattern: Any = np.asarray(solid.pattern, np.int32)
     return Skin(
         curvature_per_mm=as_f32(np.array([curvature_factor / solid.radius_1_mm, curvature_factor / solid.radius_2_mm])),
         turn_rad=as_f32(solid.turn_rad),
         feature_height_mm=as_f32(solid.feature_height_mm),
         feature_pitch_mm=as_f32(solid.feature_pitch_mm),
         feature_width=as_f32(solid.feature_width),
-        pattern=np.asarray(solid.pattern, np.int32),
+        pattern=pattern,
         site_mm=as_f32(site_mm),
         wave_numbers=as_f32(solid.wave_numbers),
         wave_amplitudes_mm=as_f32(solid.wave_amplitudes_mm),

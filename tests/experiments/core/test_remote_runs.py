@@ -106,7 +106,7 @@ def test_a_checkpoint_that_vanishes_while_files_are_listed_ends_no_copy(sent, ur
         return 0
 
     def removing(path):
-        for folder in folders if RUN in str(path) else ():
+        for folder in folders if path.name == "x" else ():
             shutil.rmtree(folder / "5", ignore_errors=True)
             shutil.rmtree(folder / "10", ignore_errors=True)
         return is_file(path)

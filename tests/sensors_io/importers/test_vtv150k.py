@@ -23,8 +23,12 @@ def test_videos_become_records(tmp_path):
     report, store = imported(list_vtv150k(source, KEEP), tmp_path / "out")
     assert report.contacts == 3
     assert report.skipped[0] == Skip(name="nameless.mp4", reason="is not named <object>_<n>")
-    assert [skip.name for skip in report.skipped[1:]] == ["soft_ball_2.mp4", "soft_ball_3.mp4"]
-    assert report.skipped[1].reason == "has the object, site and trial of soft_ball_02.mp4"
+    twice, broken = report.skipped[1:]
+    assert {twice.name, twice.reason.removeprefix("has the object, site and trial of ")} == {
+        "soft_ball_2.mp4",
+        "soft_ball_02.mp4",
+    }
+    assert broken.name == "soft_ball_3.mp4"
     assert [(k.object_id, k.trial) for k in store.contacts] == [("cup", 10), ("soft_ball", 1), ("soft_ball", 2)]
     assert store.contact(0)["digit"].frames.shape == (12, 24, 32, 3)
     assert store.objects["soft_ball"].name == "soft ball"

@@ -119,7 +119,9 @@ def read_lora(fields: Mapping[str, Any], where: Path) -> LoraConfig:
     odd = [name for name, value in wanted.items() if (fields.get(name, value) or None) != (value or None)]
     if odd:
         raise ValueError(f"{where}: {odd[0]} is {fields[odd[0]]!r}: must be {wanted[odd[0]]!r}; nothing else is read")
-    rank, alpha, stabilised = fields.get("r"), fields.get("lora_alpha"), fields.get("use_rslora", False)
+    rank: Any = fields.get("r")
+    alpha: Any = fields.get("lora_alpha")
+    stabilised = fields.get("use_rslora", False)
     if type(rank) is not int or rank < 1 or type(alpha) not in (int, float) or not 0 < alpha <= MOST_ALPHA:
         told = f"r is {rank!r} and lora_alpha {str(alpha)[:20]}"
         raise ValueError(f"{where}: {told}: must be a whole number ≥ 1 and a number above 0; correct them")
