@@ -24,13 +24,7 @@ import numpy as np
 from touchr1_jax.models.adapted_folder import read_saved
 from touchr1_jax.models.lora import of_decoder
 from touchr1_jax.models.policy import Features
-from touchr1_jax.models.saved_policy import (
-    PolicyError,
-    Precision,
-    SavedPolicy,
-    save_policy,
-    words,
-)
+from touchr1_jax.models.saved_policy import PolicyError, Precision, SavedPolicy, save_policy, words
 from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.text.plain_questions import AskedAttribute, QuestionError, read_question
 from touchr1_jax.training.compilation import compiled_quickly
@@ -302,8 +296,7 @@ def _hub(what: str, fix: str) -> Iterator[Any]:
 
         yield huggingface_hub
     except Exception as error:
-        told = " ".join(str(error).split()) or repr(error)
-        raise PolicyError(f"{what} ({told}): {fix}") from error
+        raise PolicyError(f"{what} ({' '.join(str(error).split()) or repr(error)}): {fix}") from error
 
 
 def compared(question: str, asked: AskedAttribute, one: TouchAnswer, two: TouchAnswer) -> ComparedTouches:

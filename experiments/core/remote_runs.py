@@ -129,7 +129,7 @@ def _whole(name: str) -> bool:
 
 
 def _state(path: Path) -> tuple[int, int]:
-    """What changes with the content of a file: size and time."""
+    """Size and time of a file, which change with its content."""
     with contextlib.suppress(FileNotFoundError):
         found = path.stat()
         return found.st_size, found.st_mtime_ns

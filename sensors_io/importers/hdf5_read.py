@@ -100,7 +100,7 @@ def bounds(file: Any, group: str, rows: RowsMap) -> np.ndarray:
     whole = np.issubdtype(found.dtype, np.integer) and found.ndim == 1
     ends = found.astype(np.int64) if whole else np.zeros(1, np.int64)
     ends = np.append(0, np.cumsum(ends)) if whole and rows.kind == "lengths" else ends
-    if len(ends) < 2 or ends[0] < 0 or (np.diff(ends) < 0).any():
+    if len(ends) < 2 or (ends < 0).any() or (np.diff(ends) < 0).any():  # also beyond 2⁶³
         must = (
             "lengths of all contacts" if rows.kind == "lengths" else "first rows of all contacts and the last one's end"
         )

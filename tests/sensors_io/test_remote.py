@@ -63,9 +63,13 @@ def test_gels_at_rest_are_pushed_too(records):
 
 
 def test_a_second_push_sends_what_is_new(records, monkeypatch):
-    ls = MemoryFileSystem.ls
-    tagged = lambda self, one: {**one, "ETag": f'"{hashlib.md5(self.cat_file(one["name"])).hexdigest()}"'}
-    monkeypatch.setattr(MemoryFileSystem, "ls", lambda self, *a, **k: [tagged(self, x) for x in ls(self, *a, **k)])
+    find = MemoryFileSystem.find
+
+    def tagged(self, path, **options):
+        of = lambda name: f'"{hashlib.md5(self.cat_file(name)).hexdigest()}"'
+        return {name: {**about, "ETag": of(name)} for name, about in find(self, path, **options).items()}
+
+    monkeypatch.setattr(MemoryFileSystem, "find", tagged)
     assert main(["push", str(records), URL]) == 0
     before = {name: bytes(file.getvalue()) for name, file in fsspec.filesystem("memory").store.items()}
     with RecordWriter(records, meta=fakes.META, resume=True) as writer:
