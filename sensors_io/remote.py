@@ -157,11 +157,12 @@ class Mirror:
 
         found = self._retried(listed, "")
         name = lambda path: path.partition(f"{self._path}/")[2]
-        return {name(path): str(about.get("ETag", "")).strip('"') for path, about in found.items()}
+        return {name(path): str(about.get("ETag", "")).strip('"') for path, about in found.items() if name(path)}
 
     def copy(self, folder: pathlib.Path) -> None:
         """Show all files of the URL in a folder on this machine, under their own names."""
         for name in self.files():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).symlink_to(self.fetch(name).absolute())
 
     def publish(self, folder: pathlib.Path, names: Iterable[str]) -> int:

@@ -83,6 +83,13 @@ def test_a_second_push_sends_what_is_new(records, monkeypatch):
     assert same(RecordStore(records), RecordStore(URL))
 
 
+def test_a_copy_has_the_files_of_folders_and_of_a_single_file_nothing(tmp_path):
+    fsspec.filesystem("memory").pipe("/bucket/tree/a/b", b"1")
+    Mirror("memory://bucket/tree").copy(tmp_path)
+    assert (tmp_path / "a" / "b").read_bytes() == b"1"
+    assert Mirror("memory://bucket/tree/a/b").files() == {}
+
+
 def test_the_cache_keeps_within_its_bound(records, cache, monkeypatch):
     assert main(["push", str(records), URL]) == 0
     most = 3 * max(path.stat().st_size for path in records.glob("contacts-*.arrayrecord"))
