@@ -9,15 +9,16 @@ import functools
 import hashlib
 import itertools
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from experiments.core.artifacts import jsonable
+from experiments.core.artifacts import jsonable, write_arrays
+from experiments.core.concurrency import idle_cores
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
-from experiments.mechanics.identify_features import in_threads
 from experiments.mechanics.identify_motions import choose_frames
 from sensors_io.scenes import motions
 from sensors_io.scenes.cards import solid_of
@@ -27,6 +28,7 @@ from sensors_io.scenes.sequence import make_sequence
 from sensors_io.schema import EXPLORATORY, SENSORS, Flag, SchemaError, Sequence
 from sensors_io.selection import choose_frames as salient_frames
 from sensors_io.selection import field_images, pick_frames
+from sensors_io.units import Launcher, WorkUnit, finish
 
 PROPERTIES = ("hardness", "roughness", "protrusion", "elasticity", "friction")
 """What is asked for, in the order of the A axis; each has three levels."""
@@ -36,6 +38,7 @@ LEVELS = 3
 VERSION = 1  # raised whenever the same configuration would give other contacts
 
 _OBJECTS_A_FILE = 20
+_FILES_A_WORKER = 4  # at least: a process takes seconds to start
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -121,18 +124,24 @@ class ContactBank:
 
 
 def generate(config: ContactsConfig, context: Context) -> ContactBank:
-    """The bank of a configuration, generated or read from the cache; a stopped run resumes."""
-    folder, read = f"touch_bank/{contacts_hash(config)}", []
+    """The bank of a configuration, generated or read from the cache; a stopped run resumes.
 
-    def make(rows: range) -> dict[str, np.ndarray]:
-        made = in_threads(lambda i: object_contacts(config, i), rows, lambda: None)
-        return {"frames": np.stack([x for x, _ in made]), "harm": np.stack([x for _, x in made])}
-
-    with context.progress("contacts", config.objects) as advance:
-        for start in range(0, config.objects, _OBJECTS_A_FILE):
-            rows = range(start, min(start + _OBJECTS_A_FILE, config.objects))
-            read.append(context.cached_arrays(f"{folder}/{start:06d}", functools.partial(make, rows)))
-            advance(len(rows))
+    Files of some objects are units of work, which the run's launcher computes, by default in a process for each core.
+    """
+    folder = f"touch_bank/{contacts_hash(config)}"
+    files, units = dict[str, functools.partial[dict[str, np.ndarray]]](), []
+    for start in range(0, config.objects, _OBJECTS_A_FILE):
+        name, rows = f"{folder}/{start:06d}", range(start, min(start + _OBJECTS_A_FILE, config.objects))
+        files[name] = functools.partial(contacts_of, config, rows)
+        path = (context.cache_dir / f"{name}.npz").absolute()
+        units.append(WorkUnit(name=name, run=functools.partial(_write, path, files[name]), done=path.exists))
+    launcher = context.launcher
+    if launcher.here:
+        launcher = Launcher(workers=max(1, min(idle_cores(context), len(units) // _FILES_A_WORKER)))
+    with context.progress("files of contacts", len(units)) as advance:
+        for _ in finish(units, launcher, context.print):
+            advance()
+    read = [context.cached_arrays(name, make) for name, make in files.items()]
     return ContactBank(
         frames=np.concatenate([x.pop("frames") for x in read]),
         harm=np.concatenate([x["harm"] for x in read]),
@@ -140,6 +149,16 @@ def generate(config: ContactsConfig, context: Context) -> ContactBank:
             [[solid_of(config.scenes, i).levels()[name] for name in PROPERTIES] for i in range(config.objects)]
         ),
     )
+
+
+def contacts_of(config: ContactsConfig, objects: range) -> dict[str, np.ndarray]:
+    """Frames and harm of all contacts of some objects."""
+    frames, harm = zip(*(object_contacts(config, i) for i in objects), strict=True)
+    return {"frames": np.stack(frames), "harm": np.stack(harm)}
+
+
+def _write(path: Path, make: functools.partial[dict[str, np.ndarray]]) -> None:
+    write_arrays(path, make())
 
 
 def contacts_hash(config: ContactsConfig) -> str:

@@ -18,6 +18,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int, UInt8
 
 from experiments.active.contacts import LEVELS, PROPERTIES, ContactBank
+from experiments.core.concurrency import in_threads
 from experiments.core.context import Context
 from experiments.core.loops import run_loop
 from touchr1_jax.models.frame_statistics import scaled_statistics
@@ -122,7 +123,8 @@ def patch_statistics(frames: UInt8[Array, "C F H W 3"]) -> Float[Array, "C D"]:
 
 def contact_statistics(bank: ContactBank, context: Context) -> Float[np.ndarray, "O C D"]:
     """`patch_statistics` of all contacts."""
-    return np.stack([np.asarray(patch_statistics(x)) for x in context.each("statistics of contacts", bank.frames)])
+    with context.progress("statistics of contacts", len(bank.frames)) as advance:
+        return np.stack(in_threads(lambda frames: np.asarray(patch_statistics(frames)), bank.frames, advance))
 
 
 def belief_scale(log_probs: Float[np.ndarray, "*n A K"]) -> float:

@@ -1,15 +1,13 @@
-"""Fixed features of touch and force, statistics of the true shape, and threads to compute them in.
+"""Fixed features of touch and force, and statistics of the true shape.
 
 The statistics of shape set the line that touch has to exceed.  The material ties the properties of an object together,
 so its shape predicts its hardness in part; roughness and protrusion are shape, so for them the line is a ceiling.
 """
 
-import concurrent.futures
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterable
 from collections.abc import Sequence as Seq
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,11 +21,6 @@ from sensors_io.scenes.schedule import Slot
 from sensors_io.selection import FIELD_MM_PER_COUNT
 from touchr1_jax.models.tactile_vit import force_features
 from touchr1_jax.training.linear_probe import stream_features
-
-WORKERS = 2
-
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 
 WINDOW_MM, POINTS = 18.0, 108
 """Part of the skin that is used: as much as a sensor covers, six points per mm."""
@@ -59,19 +52,6 @@ def truth(config: SceneConfig, slots: Seq[Slot], skins: Seq[surface.Skin]) -> di
         "levels": {name: np.array([level[name] for level in levels]) for name in levels[0]},
         "objects": np.array([slot.object_index for slot in slots]),
     }
-
-
-def in_threads(work: Callable[[Item], Result], items: Iterable[Item], advance: Callable[[], object]) -> list[Result]:
-    """Results of all items, in their order; `advance` is called in this thread after each."""
-    pool = concurrent.futures.ThreadPoolExecutor(WORKERS)
-    try:
-        results = []
-        for result in pool.map(work, items):
-            results.append(result)
-            advance()
-        return results
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
 
 
 def features_of(

@@ -9,7 +9,8 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
-from experiments.mechanics.identify_features import ContactData, features_of, force_of, in_threads, truth
+from experiments.core.concurrency import in_threads
+from experiments.mechanics.identify_features import ContactData, features_of, force_of, truth
 from sensors_io.live import LiveScenes
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.draws import site_of

@@ -15,7 +15,8 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, UInt8, UInt32
 
-from experiments.mechanics.identify_features import ContactData, features_of, force_of, in_threads, truth
+from experiments.core.concurrency import in_threads
+from experiments.mechanics.identify_features import ContactData, features_of, force_of, truth
 from sensors_io.scenes import contact, draws, noise, schedule, surface
 from sensors_io.scenes.cards import shortest_wave_mm
 from sensors_io.scenes.config import SceneConfig

@@ -8,7 +8,8 @@ from collections.abc import Sequence as Seq
 import numpy as np
 from jaxtyping import Float, Int
 
-from experiments.mechanics.identify_features import ContactData, in_threads
+from experiments.core.concurrency import in_threads
+from experiments.mechanics.identify_features import ContactData
 from sensors_io.schema import SENSORS
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
 from touchr1_jax.training.linear_probe import ProbeConfig, group_folds, probe_log_probs

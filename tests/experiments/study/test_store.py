@@ -11,6 +11,7 @@ import urllib.request
 import numpy as np
 import pytest
 
+from experiments.core.artifacts import read_json
 from experiments.core.context import Context, read_metrics
 from experiments.study.dataset import open_dataset
 from experiments.study.seed import StudySeed
@@ -19,6 +20,7 @@ from sensors_io import remote
 from sensors_io.__main__ import main as sensors
 from sensors_io.pipeline import ClipConfig
 from sensors_io.records import RecordStore, RecordWriter
+from sensors_io.remote import Mirror
 from sensors_io.schema import ATTRIBUTES, LEVELS, SENSORS
 from tests.experiments import tiny
 from tests.sensors_io import fakes
@@ -152,3 +154,29 @@ def test_a_store_that_takes_nothing_is_named_in_one_line(store, tmp_path, monkey
     store()
     assert sensors(["push", str(records), URL]) == 0  # the same command, once the fault is gone
     assert len(RecordStore(URL)) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_a_run_in_a_store_that_fails_is_stopped_and_goes_on_elsewhere(store, tmp_path, monkeypatch):
+    def begin(machine: str, runs_dir: str) -> subprocess.Popen:
+        monkeypatch.setenv(remote.CACHE, str(tmp_path / f"cache of {machine}"))
+        options = ["--scale", "smoke", "--runs-dir", runs_dir, "--cache-dir", str(tmp_path / machine)]
+        command = [sys.executable, "-m", "experiments", "pretrain_encoder", *options]
+        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+    assert begin("local", str(tmp_path / "runs")).wait() == 0
+    store(errors=0.05)
+    stopped = begin("first", "s3://bucket/runs")
+    assert any(re.search(r" 1/\d+, ", line) for line in stopped.stdout)  # a step is done
+    stopped.terminate()
+    assert "the run is at s3://bucket/runs" in stopped.communicate()[0]
+    assert stopped.returncode == 143
+    continued = begin("second", "s3://bucket/runs")
+    assert "continuing" in (printed := continued.communicate()[0])
+    assert continued.returncode == 0, printed
+    own = lambda run: {k: v for k, v in read_json(run / "results.json").items() if k != "timing"}
+    Mirror("s3://bucket/runs/pretrain_encoder").copy(tmp_path / "copy")
+    (there,), (here,) = ([*folder.glob("2*")] for folder in (tmp_path / "copy", tmp_path / "runs/pretrain_encoder"))
+    assert own(there) == own(here)
+    assert read_metrics(there) == read_metrics(here)
