@@ -81,7 +81,7 @@ class LearnerConfig:
     )
     grpo: GRPOConfig = GRPOConfig(
         prompts=40,
-        group=16,
+        group=12,
         micro_prompts=10,
         lr_scale=2000.0,
         algorithm=TOUCHES,
