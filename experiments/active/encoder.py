@@ -115,10 +115,14 @@ class ContactBatch:
 def patch_statistics(frames: UInt8[Array, "C F H W 3"]) -> Float[Array, "C D"]:
     """Statistics of the four quarters of every picture and the two halves of the fields below it."""
     edge = frames.shape[3]
-    parts = [scaled_statistics(x, edge // 2) for x in (frames[..., :edge, :, :], frames[..., edge:, :, :])]
-    of_patch = parts[0].shape[-1] // 2
-    split = [(x[..., :of_patch], x[..., :1, of_patch:]) for x in parts]  # those of the whole are the same for all
-    return jnp.concatenate([x.reshape(len(frames), -1) for pair in split for x in pair], -1)
+
+    def of_contact(frames: UInt8[Array, "F H W 3"]) -> Float[Array, "D"]:
+        parts = [scaled_statistics(x, edge // 2) for x in (frames[:, :edge], frames[:, edge:])]
+        of_patch = parts[0].shape[-1] // 2
+        split = [(x[..., :of_patch], x[..., :1, of_patch:]) for x in parts]  # those of the whole are the same for all
+        return jnp.concatenate([x.ravel() for pair in split for x in pair])
+
+    return jax.lax.map(of_contact, frames)  # one contact after the other stays in the processor's cache
 
 
 def contact_statistics(bank: ContactBank, context: Context) -> Float[np.ndarray, "O C D"]:

@@ -35,10 +35,13 @@ PROBE = ProbeConfig(folds=3, penalty=0.2)
 @jax.jit
 def frame_features(frames: UInt8[Array, "C F H W 3"]) -> Float[Array, "C F D"]:
     """Fixed features of each kept frame: those of the picture and those of the fields below it, without the force."""
-    edge = frames.shape[3]
-    no_force = jnp.zeros((*frames.shape[:2], 3))
-    parts = [stream_features(x, no_force) for x in (frames[..., :edge, :, :], frames[..., edge:, :, :])]
-    return jnp.concatenate([x.reshape(*frames.shape[:2], -1) for x in parts], -1)
+    edge, no_force = frames.shape[3], jnp.zeros((frames.shape[1], 3))
+
+    def of_contact(frames: UInt8[Array, "F H W 3"]) -> Float[Array, "F D"]:
+        parts = [stream_features(x, no_force) for x in (frames[:, :edge], frames[:, edge:])]
+        return jnp.concatenate([x.reshape(len(frames), -1) for x in parts], -1)
+
+    return jax.lax.map(of_contact, frames)  # one contact after the other stays in the processor's cache
 
 
 def contact_features(bank: ContactBank, context: Context) -> Float[np.ndarray, "O C F D"]:
@@ -98,7 +101,7 @@ good.  The encoders learn from the first two, each object read by one that did n
 
 READERS = "readers"  # prefix of their arrays
 
-VERSION = 3  # raised whenever the same configuration would give other tokens or beliefs
+VERSION = 4  # raised whenever the same configuration would give other tokens or beliefs
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
