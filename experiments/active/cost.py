@@ -23,6 +23,7 @@ from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.grpo import FrozenInputs, make_grpo_step, start_state
 from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.rl.touch_reward import Prices, priced_answer
+from touchr1_jax.training.compilation import committed
 from touchr1_jax.training.exploration import active_program, touch_batch_of
 from touchr1_jax.types import Params, Parsed, Target
 
@@ -113,12 +114,13 @@ def _first_token(tokens: jax.Array, target: Target) -> tuple[jax.Array, dict[str
     return reward, {"even": reward}, parsed
 
 
-def _repeated(step: Callable[..., Any], state: Any, *inputs: Any) -> Callable[[], Any]:
-    """Calls of a step, each from the state that the last one left."""
+def _repeated(step: Callable[..., Any], state: Any, batch: Any, inputs: Any) -> Callable[[], Any]:
+    """Calls of a step, each from the state that the last one left; as in training, all but the batch is committed."""
+    state, inputs = committed((state, inputs))
 
     def call() -> Any:
         nonlocal state
-        state, metrics = step(state, *inputs)
+        state, metrics = step(state, batch, inputs)
         return metrics
 
     return call
