@@ -47,6 +47,7 @@ def test_a_worker_that_computes_other_bits_is_refused(context, tmp_path, monkeyp
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:os.fork", "ignore:Exception ignored in:pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("launcher", [("--launcher.workers", "2"), ("--launcher", "ray", "--launcher.workers", "2")])
 def test_a_study_by_workers_is_equal_to_the_bit(tmp_path, monkeypatch, capfd, launcher):
     if "ray" in launcher:
