@@ -184,6 +184,7 @@ def test_the_update_is_that_of_the_steps_own_rollouts(training, stand_in, tmp_pa
     assert len(lengths) == 2  # absent streams and pictures are not sent
 
 
+@pytest.mark.slow
 def test_in_bfloat16_the_mismatch_is_small_and_not_zero(folder, tmp_path):
     policy = policy_of(folder, "bfloat16")
     training = Training(policy, dataclasses.replace(CONFIG, bfloat16=True))
@@ -202,6 +203,7 @@ def test_rollouts_of_other_weights_are_dropped_and_change_nothing(training, stan
     jax.tree.map(np.testing.assert_array_equal, state.params, training.trained)
 
 
+@pytest.mark.slow
 def test_the_most_likely_tokens_reach_score_centering(policy, training, stand_in, tmp_path):
     """With the learner's own weights on the server the drift is zero, and so is what is subtracted."""
     algorithm = dataclasses.replace(ALGORITHM, score_centering=8)
@@ -283,26 +285,6 @@ def fails(training, drawn, message: str) -> None:
         drawn(state, training.batch)
     jax.tree.map(np.testing.assert_array_equal, before, state.params)
     assert state.step == 0
-
-
-def test_a_server_that_stays_silent_is_named(training, stand_in, tmp_path):
-    drawn = drawing(training, stand_in, tmp_path, tries=1, timeout_s=PATIENCE_S)
-    drawn(training.state(), training.batch)  # compiles what the server runs
-    stand_in.faults = [silent] * P
-    fails(training, drawn, "gave no answer in 1 tries, the last ended in TimeoutError")
-
-
-def test_a_server_without_the_adapters_is_named(training, stand_in, tmp_path, monkeypatch):
-    monkeypatch.setattr(stand_in, "served", Forgetful())
-    message = r"refuses with status 404 \(.*The model `touch-\w+` does not exist"
-    fails(training, drawing(training, stand_in, tmp_path, **QUICK), message)
-
-
-class Forgetful(dict):
-    """Adapters that are lost as soon as they are loaded."""
-
-    def __setitem__(self, name, value):
-        """Keep nothing."""
 
 
 def test_a_server_that_is_down_is_named_before_anything_is_made(training, tmp_path):

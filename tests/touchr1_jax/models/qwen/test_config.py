@@ -1,12 +1,9 @@
 """Configs as published and as newer libraries nest them, and what is refused."""
 
-import dataclasses
-import json
-
 import pytest
 
 from tests.touchr1_jax.models.qwen.cases import SHAPES, config_json, qwen3_json
-from touchr1_jax.models.qwen.config import QwenConfig, QwenVisionConfig, released
+from touchr1_jax.models.qwen.config import QwenVisionConfig, released
 from touchr1_jax.models.qwen.config_file import parse_config, read_config
 
 SEVEN_B = {
@@ -66,11 +63,6 @@ def test_released_config_is_read():
 @pytest.mark.parametrize("flat", [SEVEN_B, config_json(), config_json(tied=False)])
 def test_nested_config_is_the_flat_one(flat):
     assert parse_config(nested(flat)) == parse_config(flat)
-
-
-def test_directory_is_read(tmp_path):
-    (tmp_path / "config.json").write_text(json.dumps(SEVEN_B))
-    assert read_config(tmp_path) == released("7B")
 
 
 def test_missing_and_broken_files(tmp_path):
@@ -234,9 +226,3 @@ def test_a_missing_field_of_qwen3_is_named(part):
 def test_unknown_size_is_refused():
     with pytest.raises(ValueError, match="size is '14B': must be one of 3B, 7B"):
         released("14B")
-
-
-def test_configs_shrink_by_replacement():
-    small = dataclasses.replace(released("7B").vision, depth=2, full_layers=(1,))
-    assert isinstance(small, QwenVisionConfig)
-    assert isinstance(dataclasses.replace(released("7B"), vision=small), QwenConfig)

@@ -59,13 +59,7 @@ def test_a_pointer_is_named(tmp_path):
         read_header(tmp_path / "x")
 
 
-def test_header_must_be_json(tmp_path):
-    raw_file(tmp_path / "x", b"not json", b"")
-    with pytest.raises(ValueError, match="the header is no JSON"):
-        read_header(tmp_path / "x")
-
-
-@pytest.mark.parametrize("header", [b"[]", b"7", b"[" * 100_000, b'{"a": 3}', b'{"a": "dtype"}'])
+@pytest.mark.parametrize("header", [b"not json", b"[]", b"7", b"[" * 100_000, b'{"a": 3}', b'{"a": "dtype"}'])
 def test_header_must_be_an_object_of_objects(tmp_path, header):
     raw_file(tmp_path / "x", header, b"")
     with pytest.raises(ValueError, match=r"header is no JSON|a lacks data_offsets"):
@@ -93,12 +87,6 @@ def test_shapes_and_offsets_must_be_sizes(tmp_path, change):
 def test_bytes_must_fit_the_shape(tmp_path):
     raw_file(tmp_path / "x", {"a": {"dtype": "F32", "shape": [4], "data_offsets": [0, 12]}}, bytes(12))
     with pytest.raises(ValueError, match="a has 12 bytes, its type and shape need 16"):
-        read_header(tmp_path / "x")
-
-
-def test_entries_must_be_whole(tmp_path):
-    raw_file(tmp_path / "x", {"a": {"dtype": "F32", "shape": [4]}}, bytes(16))
-    with pytest.raises(ValueError, match="a lacks data_offsets"):
         read_header(tmp_path / "x")
 
 
