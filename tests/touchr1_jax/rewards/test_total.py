@@ -131,10 +131,7 @@ def test_a_bare_function_in_the_dictionary_is_named():
             Reward(lambda p, t: 1.0 if p.length > 5 else 0.0),
             r"reward 'mine': value cannot be traced, .*test_total\.py:\d+ needs .*jnp\.where .*HostReward",
         ),
-        (
-            Reward(lambda p, t: np.mean(np.asarray(p.conclude))),
-            r"reward 'mine': value cannot be traced, .*jnp instead",
-        ),
+        (Reward(lambda p, t: np.mean(np.asarray(p.conclude))), r"reward 'mine': value cannot be traced, .*jnp instead"),
     ],
 )
 def test_bad_rewards_fail_when_traced(reward, message):

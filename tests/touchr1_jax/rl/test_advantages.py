@@ -97,10 +97,9 @@ def test_groups_without_signal_are_those_whose_advantages_are_zero(kind):
     idle = no_signal(algorithm, a + b, terms)
     if kind is not Advantage.PER_REWARD:  # where the terms cancel, they do so in the sum of advantages too
         np.testing.assert_array_equal(idle, ~jnp.any(advantages(algorithm, a + b, terms) != 0, -1))
-    assert idle.tolist() == {
-        Advantage.GLOBAL: [False, False, False],
-        Advantage.PER_REWARD: [True, False, False],
-    }.get(kind, [True, False, True])
+    assert idle.tolist() == {Advantage.GLOBAL: [False, False, False], Advantage.PER_REWARD: [True, False, False]}.get(
+        kind, [True, False, True]
+    )
 
 
 @pytest.mark.parametrize("k", [1, 2, 3, 6])
