@@ -119,6 +119,21 @@ def test_greedy_completion_is_the_most_likely_token_at_every_step(batch):
     np.testing.assert_array_equal(jnp.where(said.mask, best, 0), jnp.where(said.mask, said.tokens, 0))
 
 
+def test_banned_ids_are_never_sampled(batch):
+    """10⁴ tokens; the policy's own scores prefer the banned ids by far."""
+    params = tiny.params()
+    table = params["decoder"]["embedding"]["embedding"]
+    loved = {
+        "decoder": {**params["decoder"], "embedding": {"embedding": table.at[tiny.TOKENIZER.banned].multiply(20.0)}}
+    }
+    many = dataclasses.replace(DRAW, group=1000, length=5)
+    said = jax.jit(lambda p, b, k: sample_group(tiny.FNS, p, b, k, many))(loved, batch, jax.random.key(0))
+    tokens = said.tokens[said.mask]
+    assert len(tokens) > 5000
+    assert not tiny.TOKENIZER.banned[tokens].any()
+    assert len(np.unique(tokens)) > 10
+
+
 @pytest.mark.parametrize(("layers", "stacks"), [(1, [()]), (3, [(), (), ()]), (12, [(11,), ()])])
 def test_empty_cache_has_the_shape_of_the_decoder(layers, stacks):
     c = dataclasses.replace(tiny.CONFIG.decoder, num_layers=layers)

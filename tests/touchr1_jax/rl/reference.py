@@ -87,8 +87,9 @@ def loss(algorithm, *, prompts: int, **x: np.ndarray) -> tuple[float, dict[str, 
         average = lambda y, mask=mask: (np.where(mask, y, 0).sum(1) / mask.sum(1)).mean()
         surrogate, kl = average(objective), average(x["reference_kl"][p])
         grounding, entropy = average(x["grounding"][p]), average(x["entropy"][p])
-        gain = algorithm.gamma * grounding - algorithm.beta * kl + algorithm.entropy_weight * entropy
-        total += weight * surrogate + gain / prompts
+        grounded = min(algorithm.gamma * grounding, algorithm.grounding_budget or np.inf)
+        explored = algorithm.entropy_weight * min(entropy, algorithm.entropy_floor_nat or np.inf)
+        total += weight * surrogate + (grounded - algorithm.beta * kl + explored) / prompts
         for name, value in zip(found, (surrogate, kl, grounding, entropy), strict=True):
             found[name].append(value)
     return -total, {name: np.array(values) for name, values in found.items()}

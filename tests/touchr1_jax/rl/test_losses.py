@@ -9,6 +9,7 @@ from tests.touchr1_jax.rl import reference
 from touchr1_jax.rl.config import Average, GRPOConfig, Paper, Surrogate
 from touchr1_jax.rl.losses import (
     TokenTerms,
+    at_most,
     check_centering,
     divisor,
     entropy,
@@ -18,6 +19,7 @@ from touchr1_jax.rl.losses import (
     group_mean,
     grpo_loss,
     surrogate,
+    token_terms,
 )
 
 RATIO = np.array([0.5, 0.9, 1.0, 1.1, 2.0])
@@ -104,9 +106,17 @@ def loss_arguments() -> dict[str, np.ndarray]:
     }
 
 
-def test_loss_and_parts_are_their_formulas():
-    """Of the loss under every option `test_reference_gradients` has the formula."""
-    arguments, algorithm = loss_arguments(), Paper(beta=0.1, gamma=0.05, entropy_weight=0.1, importance_cap=1.2)
+LOUD = {"beta": 0.1, "entropy_weight": 0.1, "importance_cap": 1.2}
+
+
+@pytest.mark.parametrize(
+    "algorithm",
+    [Paper(gamma=0.05, **LOUD), Paper(gamma=0.1, grounding_budget=0.15, entropy_floor_nat=1.0, **LOUD)],
+    ids=["free", "up to bounds"],
+)
+def test_loss_and_parts_are_their_formulas(algorithm):
+    """The other options are those of `test_reference_gradients`."""
+    arguments = loss_arguments()
     config = GRPOConfig(prompts=4, micro_prompts=4, group=4, length=9, algorithm=algorithm)
     arrays = {name: jnp.asarray(x, bool if x.dtype == bool else jnp.float32) for name, x in arguments.items()}
     terms = TokenTerms(*(arrays.pop(name) for name in ("log_prob", "reference_kl", "grounding", "entropy")))
@@ -120,6 +130,27 @@ def test_loss_and_parts_are_their_formulas():
     np.testing.assert_allclose(
         parts["grounding_peak"], np.where(mask, arguments["grounding"], 0).max((1, 2)), rtol=1e-6
     )
+
+
+def test_a_bound_cuts_the_gradient_off():
+    gradient = jax.vmap(jax.grad(lambda x: at_most(x, 0.5)))
+    np.testing.assert_array_equal(gradient(jnp.array([0.3, 0.7])), [1, 0])
+    assert at_most(jnp.array(3.0), None) == 3.0
+
+
+def test_cap_bounds_the_grounding_of_each_token_and_cuts_its_gradient():
+    rng = np.random.default_rng(0)
+    branches = [jnp.asarray(rng.normal(0, 2, (4, 6)), jnp.float32) for _ in range(2)]
+
+    def grounding(p, q, cap=None):
+        log_p, log_q = jax.nn.log_softmax(p), jax.nn.log_softmax(q)
+        return token_terms(Paper(grounding_cap_nat=cap), jnp.zeros(4, jnp.int32), log_p, None, log_q).grounding
+
+    free = grounding(*branches)
+    cap = float(jnp.median(free))
+    np.testing.assert_allclose(grounding(*branches, cap), np.minimum(free, cap), rtol=1e-6)
+    gradient = jax.grad(lambda p, q: grounding(p, q, cap).sum())(*branches)
+    np.testing.assert_array_equal(jnp.any(gradient != 0, -1), free < cap)
 
 
 def test_entropy_is_the_distance_from_the_uniform():
