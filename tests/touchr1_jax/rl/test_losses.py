@@ -25,11 +25,10 @@ from touchr1_jax.rl.losses import (
 RATIO = np.array([0.5, 0.9, 1.0, 1.1, 2.0])
 
 
-def surrogate_of(log_prob, advantage: float, *, low: float = 0.2, high: float = 0.3, kind=Surrogate.TOKEN, mask=True):
+def surrogate_of(log_prob, advantage: float):
     """Value, clip flag and d Σ value / d log π of one rollout whose old log-probabilities are 0."""
-    algorithm = Paper(surrogate=kind, clip_low=low, clip_high=high)
-    zero = jnp.zeros(len(log_prob))
-    run = lambda x: surrogate(algorithm, x, zero, jnp.broadcast_to(jnp.array(mask), zero.shape), jnp.array(advantage))
+    algorithm, zero = Paper(clip_low=0.2, clip_high=0.3), jnp.zeros(len(log_prob))
+    run = lambda x: surrogate(algorithm, x, zero, zero == 0, jnp.array(advantage))
     x = jnp.asarray(log_prob, jnp.float32)
     return *run(x), jax.grad(lambda x: run(x)[0].sum())(x)
 
