@@ -45,7 +45,7 @@ def test_sample_variance():
 
 
 @pytest.mark.parametrize("name", STATISTICS)
-@hypothesis.settings(max_examples=10, deadline=None)
+@hypothesis.settings(max_examples=25, deadline=None)
 @hypothesis.given(
     x=hnp.arrays(np.float32, (3, 4), elements=st.floats(-100, 100, width=32)), mask=hnp.arrays(bool, (3, 4))
 )

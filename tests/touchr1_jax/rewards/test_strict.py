@@ -84,7 +84,7 @@ GATED = {"accuracy_debiased": 0.6, "consistency_gated": 0.3, "format": 0.1}
 REWARDS_UNIFORM = make_rewards(with_prior(PRIORS[0]))
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", range(5))
 def test_expected_earnings_agree_with_drawing(seed):
     rng = np.random.default_rng(seed)
     found = earnings(REWARDS_UNIFORM, PUBLISHED, PRIORS[0])

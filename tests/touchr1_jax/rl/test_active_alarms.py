@@ -6,12 +6,27 @@ from touchr1_jax.rl.active_alarms import ACTIVE_RULES
 from touchr1_jax.rl.alarms import WINDOW, AlarmMonitor
 
 HEALTHY = {
-    "accuracy": 0.6, "grounding": 0.1, "degenerate_share": 0.2, "all_right_share": 0.2, "kl_cost_peak": 0.05,
-    "entropy": 0.5, "perturbed_stream_0": 4.0, "grounding_stream_0": 0.1, "touch_share": 1.0, "nonfinite_share": 0.0,
-    "budget": 3.0, "kinds": 4.0, "questions": 5.0, "no_action_share": 0.05, "one_action_share": 0.6,
-    "all_actions_share": 0.1, "silent_share": 0.1, "first_kind_peak": 0.6, "first_kind_information": 0.5,
+    "accuracy": 0.6,
+    "grounding": 0.1,
+    "degenerate_share": 0.2,
+    "all_right_share": 0.2,
+    "kl_cost_peak": 0.05,
+    "entropy": 0.5,
+    "perturbed_stream_0": 4.0,
+    "grounding_stream_0": 0.1,
+    "touch_share": 1.0,
+    "nonfinite_share": 0.0,
+    "budget": 3.0,
+    "kinds": 4.0,
+    "questions": 5.0,
+    "no_action_share": 0.05,
+    "one_action_share": 0.6,
+    "all_actions_share": 0.1,
+    "silent_share": 0.1,
+    "first_kind_peak": 0.6,
+    "first_kind_information": 0.5,
     "reward_seconds": -0.1,
-}  # fmt: skip
+}
 FAILURES = {
     "A1": ({"no_action_share": 1.0}, 1.0),
     "A2": ({"one_action_share": 1.0}, 1.0),

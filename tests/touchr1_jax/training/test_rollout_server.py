@@ -184,7 +184,6 @@ def test_the_update_is_that_of_the_steps_own_rollouts(training, stand_in, tmp_pa
     assert len(lengths) == 2  # absent streams and pictures are not sent
 
 
-@pytest.mark.slow
 def test_in_bfloat16_the_mismatch_is_small_and_not_zero(folder, tmp_path):
     policy = policy_of(folder, "bfloat16")
     training = Training(policy, dataclasses.replace(CONFIG, bfloat16=True))
@@ -203,7 +202,6 @@ def test_rollouts_of_other_weights_are_dropped_and_change_nothing(training, stan
     jax.tree.map(np.testing.assert_array_equal, state.params, training.trained)
 
 
-@pytest.mark.slow
 def test_the_most_likely_tokens_reach_score_centering(policy, training, stand_in, tmp_path):
     """With the learner's own weights on the server the drift is zero, and so is what is subtracted."""
     algorithm = dataclasses.replace(ALGORITHM, score_centering=8)
