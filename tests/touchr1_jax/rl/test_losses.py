@@ -121,7 +121,7 @@ def test_loss_and_parts_are_their_formulas(algorithm):
     terms = TokenTerms(*(arrays.pop(name) for name in ("log_prob", "reference_kl", "grounding", "entropy")))
     loss, parts = grpo_loss(terms, **arrays, config=config)
     expected, means = reference.loss(algorithm, prompts=4, **arguments)
-    assert float(loss) == pytest.approx(expected, rel=1e-5)
+    assert float(loss) == pytest.approx(expected, rel=1e-5, abs=1e-7)  # terms of .1 nearly cancel
     for name, value in means.items():
         np.testing.assert_allclose(parts[name], value, rtol=1e-5, err_msg=name)
     mask = arguments["mask"]
