@@ -152,6 +152,20 @@ def test_cap_bounds_the_grounding_of_each_token_and_cuts_its_gradient():
     np.testing.assert_array_equal(jnp.any(gradient != 0, -1), free < cap)
 
 
+def test_terms_of_policies_that_are_not_run_are_zero():
+    log_p = jax.nn.log_softmax(jnp.asarray(RNG.normal(0, 2, (4, 6)), jnp.float32))
+    terms = token_terms(Paper(), jnp.zeros(4, jnp.int32), log_p, None, None)
+    assert not terms.reference_kl.any()
+    assert not terms.grounding.any()
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.1])
+def test_entropy_has_a_gradient_where_it_is_paid_for(weight):
+    algorithm, scores = Paper(entropy_weight=weight), jnp.asarray(RNG.normal(0, 2, (4, 6)), jnp.float32)
+    of = lambda x: token_terms(algorithm, jnp.zeros(4, jnp.int32), jax.nn.log_softmax(x), None, None).entropy.sum()
+    assert bool(jax.grad(of)(scores).any()) is (weight > 0)
+
+
 def test_entropy_is_the_distance_from_the_uniform():
     """H(p) = log V − KL(p ‖ uniform), with banned tokens as the decoder writes them."""
     log_p = jax.nn.log_softmax(jnp.array([1.0, 0.3, -2, -1e9]))

@@ -1,5 +1,7 @@
 """Languages that would be read in two ways are refused."""
 
+import dataclasses
+
 import pytest
 
 from touchr1_jax.text.language import MATERIAL, TOUCH_LANGUAGE, Attribute, Language, Sensor
@@ -32,3 +34,10 @@ def test_attributes_are_found_by_name():
 def test_levels_are_ordinal_unless_they_say_otherwise():
     assert [a.ordinal for a in TOUCH_LANGUAGE.attributes] == [True, True, True, False]
     assert not any(a.ordered for a in TOUCH_LANGUAGE.attributes)
+
+
+@pytest.mark.parametrize("part", [TOUCH_LANGUAGE, MATERIAL, SENSORS[0]], ids=lambda part: type(part).__name__)
+def test_parts_of_a_language_are_given_by_name_and_never_change(part):
+    assert all(field.kw_only for field in dataclasses.fields(part))
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        setattr(part, dataclasses.fields(part)[0].name, None)

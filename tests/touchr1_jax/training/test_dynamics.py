@@ -175,3 +175,14 @@ def test_fewer_frames_are_read(batch):
     assert read_frames(CONFIG, batch) is batch
     short = read_frames(dataclasses.replace(CONFIG, frames_kept=2), batch)
     np.testing.assert_array_equal(short.frames, fewer_frames(batch, 2).frames)
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"encoder": dataclasses.replace(ENCODER, causal=False)}, "encoder.causal is False"),
+    ],
+)
+def test_bad_configs_are_refused(change, match):
+    with pytest.raises(ValueError, match=match):
+        dataclasses.replace(CONFIG, **change)

@@ -96,6 +96,7 @@ def test_misfits_are_named(folder, change, message):
     [
         ("peft_type", "LOHA", "peft_type is 'LOHA': must be 'LORA'"),
         ("use_dora", True, "use_dora is True: must be False"),
+        ("alpha_pattern", {"q_proj": 64}, "alpha_pattern is "),
         ("bias", "all", "bias is 'all': must be 'none'"),
         ("r", 0, "r is 0 and lora_alpha 5.0: must be"),
         ("lora_alpha", float("inf"), "lora_alpha inf: must be"),
