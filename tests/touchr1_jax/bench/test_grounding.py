@@ -67,9 +67,9 @@ def test_every_control_is_asked_for():
 
 
 def test_conflict_and_revision_by_hand():
-    label = np.array([0, 1, 2, 2, 1])
-    prior = np.array([1, 1, 0, 0, -1])  # conflicts are questions 0, 2 and 3
-    answer = np.array([0, 1, 1, 0, 1])
-    assert grounding.conflict_accuracy(answer, label, prior).mean() == pytest.approx(100 / 3)
-    assert grounding.revision_rate(answer, label, prior).mean() == pytest.approx(200 / 3)
-    assert grounding.conflict_accuracy(answer, label, prior).items.tolist() == [0, 2, 3]
+    label = np.array([0, 1, 2, 2, 1, 0])
+    prior = np.array([1, 1, 0, 0, -1, 2])  # conflicts are questions 0, 2, 3 and 5
+    answer = np.array([0, 1, 1, 0, 1, -1])
+    assert grounding.conflict_accuracy(answer, label, prior).mean() == pytest.approx(25)
+    assert grounding.revision_rate(answer, label, prior).mean() == pytest.approx(50)
+    assert grounding.conflict_accuracy(answer, label, prior).items.tolist() == [0, 2, 3, 5]

@@ -145,7 +145,7 @@ def test_kappa_by_hand():
     # 20 yes/yes, 15 no/no, 5 + 10 apart of 50: observed .7, expected .5 (a textbook case)
     a = np.repeat([1, 1, 0, 0], [20, 5, 10, 15])
     b = np.repeat([1, 0, 1, 0], [20, 5, 10, 15])
-    assert statistics.cohens_kappa(a, b, 2) == pytest.approx(0.4)
+    assert statistics.cohens_kappa(a, b, 2) == pytest.approx(0.4) == statistics.cohens_kappa(b, a, 2)
 
 
 def test_quadratic_weights_forgive_the_neighbour():
