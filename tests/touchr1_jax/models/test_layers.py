@@ -1,13 +1,22 @@
 """Layers against their equations."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from touchr1_jax.models.layers import GatedMLP, KeySource, RMSNorm, attend, mrope, rotate
+from touchr1_jax.models.layers import MASKED, GatedMLP, KeySource, RMSNorm, attend, mrope, rotate
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
+
+RNG = np.random.default_rng(0)
+
+
+def normal(*shape: int) -> jax.Array:
+    return jnp.asarray(RNG.normal(size=shape), jnp.float32)
 
 
 def test_rms_norm_by_hand():
@@ -57,10 +66,49 @@ def test_rotation_of_a_unit_vector_by_hand():
     )
 
 
+@given(shift=st.integers(0, 200), gap=st.tuples(*[st.integers(-20, 20)] * 3))
+@settings(max_examples=20, deadline=None)
+def test_scores_depend_on_the_difference_of_positions_alone(shift, gap):
+    q, k = np.random.default_rng(1).normal(size=(2, 1, 8)).astype(np.float32)
+    at = lambda x, p: rotate(jnp.asarray(x)[None], mrope(jnp.asarray(p)[:, None], 8, (1, 1, 2), 1e4))[0]
+    score = lambda base: at(q, np.full(3, base)) @ at(k, base + np.array(gap)).T
+    np.testing.assert_allclose(score(30), score(30 + shift), atol=2e-4)
+
+
+def test_attend_over_blocks_is_attention_over_their_union():
+    """Oracle: one softmax over the concatenated keys, head by head; query head h reads key head h // 2."""
+    t, kv, r, d, sizes = 3, 2, 2, 4, (5, 3)
+    q = normal(t, kv, r, d)
+    blocks = [(normal(kv, n, d), normal(kv, n, d)) for n in sizes]
+    masks = [jnp.asarray(RNG.random(sizes[0]) < 0.6), jnp.tril(jnp.ones((t, sizes[1]), bool))]
+    ours = attend(q, [KeySource(k, v, m) for (k, v), m in zip(blocks, masks, strict=True)])
+    keys, values = (jnp.concatenate([b[i] for b in blocks], 1) for i in (0, 1))
+    mask = jnp.concatenate([jnp.broadcast_to(m, (t, n)) for m, n in zip(masks, sizes, strict=True)], 1)
+    heads = []
+    for h in range(kv * r):
+        scores = q[:, h // r, h % r] @ keys[h // r].T / d**0.5
+        heads.append(jax.nn.softmax(jnp.where(mask, scores, -jnp.inf), -1) @ values[h // r])
+    np.testing.assert_allclose(ours, jnp.concatenate(heads, -1), rtol=1e-5, atol=1e-6)
+
+
 def test_attend_survives_scores_that_overflow_exp():
     k = jnp.array([[[200.0], [-200.0]]])
     out = attend(jnp.full((1, 1, 1, 1), 100.0), [KeySource(k, k, jnp.ones(2, bool))])
     np.testing.assert_allclose(out, [[200.0]])
+
+
+def test_masked_keys_have_weight_and_gradient_exactly_zero():
+    q, k, v = normal(2, 1, 1, 4), normal(1, 3, 4), normal(1, 3, 4)
+    mask = jnp.array([True, False, True])
+    gradient = jax.grad(lambda k, v: attend(q, [KeySource(k, v, mask)]).sum(), (0, 1))(k, v)
+    for g in gradient:
+        assert not g[:, 1].any()
+        assert g[:, 0].any()
+
+
+def test_two_masked_scores_differ_by_zero():
+    assert jnp.float32(MASKED) - jnp.float32(MASKED) == 0
+    assert 0 * jnp.float32(MASKED) == 0
 
 
 @pytest.mark.parametrize(

@@ -107,3 +107,25 @@ def test_the_command_line_chooses_a_preset_and_changes_it():
     assert chosen == dataclasses.replace(default, group=6, algorithm=Stable(gamma=0.0))
     variant = tyro.cli(GRPOConfig, args=["algorithm:dr-grpo", "--algorithm.surrogate", "CISPO"], default=default)
     assert variant.algorithm == DrGrpo(surrogate=Surrogate.CISPO)
+
+
+def test_the_command_line_reaches_every_option():
+    """A flag for each field; those of the README among them."""
+    sizes = ["--temperature", "0.8", "--top-p", "0.9", "--min-p", "0.05", "algorithm:paper"]
+    flags = {"stale": "2", "minibatches": "2", "importance-cap": "2", "reference-every": "1", "reference-share": "0.1"}
+    flags |= {"average": "BATCH"}
+    switches = ["importance-sequence", "kl-in-reward", "mask-truncated"]
+    named = [word for name, value in flags.items() for word in (f"--algorithm.{name}", value)]
+    config = tyro.cli(GRPOConfig, args=[*sizes, *named, *(f"--algorithm.{name}" for name in switches)])
+    assert (config.temperature, config.top_p, config.min_p) == (0.8, 0.9, 0.05)
+    assert config.algorithm == Paper(
+        stale=2,
+        minibatches=2,
+        importance_cap=2.0,
+        importance_sequence=True,
+        reference_every=1,
+        reference_share=0.1,
+        kl_in_reward=True,
+        mask_truncated=True,
+        average=Average.BATCH,
+    )

@@ -88,6 +88,19 @@ def test_loss_and_parts_equal_a_float64_reference(experience, whole):
     assert parts["grounding"] > 0.1
 
 
+def test_gradient_is_that_of_the_loss(experience, whole):
+    """A directional derivative of the float32 loss against the dot product with the gradient."""
+    rng = np.random.default_rng(1)
+    direction = jax.tree.map(lambda x: rng.normal(size=x.shape).astype(np.float32), PARAMS)
+    forward = lambda params: compute(experience, params)[1]["loss"]
+    h = 1e-3
+    moved = lambda by: jax.tree.map(lambda x, d: np.asarray(x) + np.float32(by) * d, PARAMS, direction)
+    ahead, behind = moved(h), moved(-h)
+    slope = (float(forward(ahead)) - float(forward(behind))) / (2 * h)
+    dot = sum(float(np.vdot(g, d)) for g, d in zip(*map(jax.tree.leaves, (whole[0], direction)), strict=True))
+    assert slope == pytest.approx(dot, rel=2e-2)
+
+
 @pytest.fixture(scope="module")
 def one_stream(experience) -> Experience:
     """The same with stream 0 or 1 alone perturbed."""
@@ -118,6 +131,13 @@ def test_an_anchor_adds_the_likelihood_of_the_answers_and_its_gradient(experienc
         np.testing.assert_allclose(a, plain - 0.7 * more, atol=1e-5 * scale)
     with pytest.raises(ValueError, match="anchor is above 0, but the batch holds no verified answers"):
         gradient(anchored)(experience)
+
+
+def test_stopped_branch_changes_the_gradient_but_no_value(one_stream):
+    stopped = dataclasses.replace(CONFIG, algorithm=dataclasses.replace(ALGORITHM, grounding_stop_masked=True))
+    (free, free_parts, _), (held, held_parts, _) = compute(one_stream, PARAMS), gradient(stopped)(one_stream)
+    np.testing.assert_allclose(held_parts["loss"], free_parts["loss"], rtol=1e-5)
+    assert any(np.abs(np.subtract(a, b)).max() > 1e-4 for a, b in zip(*map(jax.tree.leaves, (free, held)), strict=True))
 
 
 def test_grounding_is_logged_for_every_stream(one_stream):

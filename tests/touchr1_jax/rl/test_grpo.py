@@ -82,6 +82,12 @@ def run() -> Run:
     return Run()
 
 
+def test_no_nan_under_debug_nans(run):
+    """`debug_nans` looks at every array that leaves the program."""
+    with jax.debug_nans(True):
+        run.step(tiny.copy(run.before[0]), run.batches[0], FROZEN)
+
+
 draw = jax.jit(lambda p, b, k: sample_group(FNS, p, b, k, DRAW))
 
 
@@ -194,6 +200,13 @@ def test_metrics_are_finite_scalars(run):
             assert np.isfinite(value), name
     expected = {"loss", "surrogate", "kl", "grounding", "entropy", "clip_share", "reward", "reward_right", "grad_norm"}
     assert expected <= set(run.metrics[0])
+
+
+def test_grounding_of_every_stream_is_logged(run):
+    for metrics in run.metrics:
+        assert sum(metrics[f"perturbed_stream_{s}"] for s in range(tiny.S)) == P
+        present = [s for s in range(tiny.S) if metrics[f"perturbed_stream_{s}"]]
+        assert all(metrics[f"grounding_stream_{s}"] > 1e-3 for s in present)
 
 
 def test_surrogate_is_on_policy(run):

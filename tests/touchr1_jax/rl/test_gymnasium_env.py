@@ -51,6 +51,13 @@ def test_an_episode_by_hand(env):
     assert reward == pytest.approx(1 - 0.05 * BANK.seconds[1, 1] - 0.1 * BANK.harm[1, 1], rel=1e-5)
 
 
+def test_a_contact_that_is_missing_is_not_seen(env):
+    env.reset(options={"prompt": 2})
+    seen, *_, totals = env.step(1)
+    assert not seen["touch"].any()
+    assert (totals["seconds"], totals["harm"]) == (pytest.approx(BANK.seconds[3, 1]), 0.0)
+
+
 def test_one_action_too_many_ends_without_an_answer(env):
     env.reset(options={"prompt": 0})
     for _ in range(BUDGET):

@@ -98,6 +98,14 @@ def test_an_optimizer_of_a_callers_own_never_receives_what_is_not_finite(bad):
     assert count_skipped(state).tolist() == [1, 1]
 
 
+def test_finite_gradients_reach_it_as_they_are():
+    grads = {"w": jnp.array([1.0, -2.0, 0.5])}
+    state = OPTIMIZER.init(PARAMS)
+    updates, after = OPTIMIZER.update(grads, state, PARAMS)
+    found = finite_update(OPTIMIZER, grads, optax.tree.norm(grads), state, PARAMS)
+    jax.tree.map(np.testing.assert_array_equal, found, (optax.apply_updates(PARAMS, updates), after))
+
+
 def test_dynamic_sampling_logs_what_it_passed_over():
     """Its candidates' metrics are those of a step that learns from all; the selected ones hide constant groups."""
 

@@ -83,8 +83,17 @@ def test_without_an_update_in_between_bfloat16_clips_nothing_though_the_sampler_
     assert metrics["sampler_gap_peak"] > 1e-4
 
 
+def test_without_a_lag_the_step_is_on_policy(on_policy):
+    """At the first step a lagging sampler has not fallen behind yet."""
+    _, after, metrics = on_policy
+    step, state = of(stale=2)
+    state, found = step(state, BATCH, FROZEN)
+    assert len(state.behind) == 2
+    assert found["reward"] == metrics["reward"]
+    close(state.params, after.params, rtol=1e-4, atol=1e-7)
+
+
 def test_a_state_without_older_parameters_cannot_lag():
-    assert len(of(stale=2)[1].behind) == 2
     step, _ = of(stale=1)
     _, state = of()
     with pytest.raises(ValueError, match="stale is 1, but the state holds 0 older parameters; make"):

@@ -71,6 +71,13 @@ def test_without_an_end_the_loop_runs_to_the_length():
     assert (said.tokens == 5).all()
 
 
+def test_compiled_and_uncompiled_agree(said):
+    with jax.disable_jit():
+        plain = draw()
+    for a, b in zip(jax.tree.leaves(said), jax.tree.leaves(plain), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6)
+
+
 SCORES = jnp.asarray(np.random.default_rng(0).normal(0, 1.5, V), jnp.float32).at[PAD].set(-1e9)
 
 
@@ -104,6 +111,11 @@ def test_inverse_draws_by_hand():
     logits = jnp.log(jnp.array([1e-30, 0.5, 0.3, 1e-30, 0.2]))
     u = jnp.array([0.0, 0.49, 0.51, 0.79, 0.81, 0.999])
     np.testing.assert_array_equal(inverse_draw(jnp.tile(logits, (6, 1)), u), [0, 1, 2, 2, 4, 4])
+
+
+def test_settings_of_the_sampler_never_change():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        CONFIG.greedy = False
 
 
 def test_tokens_of_a_rollout_are_independent_draws():

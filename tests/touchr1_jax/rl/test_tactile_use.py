@@ -72,6 +72,13 @@ def test_literal_by_hand():
     np.testing.assert_array_equal(literal(own, jnp.array(0.3), is_right, 0.1), [1, 0, 0, 1])
 
 
+def test_nothing_right_earns_nothing():
+    """Video-R1's bonus for correct frames' order is paid at zero accuracy; this one cannot be."""
+    zero = jnp.zeros(4)
+    assert not recommended(zero, jnp.array(0.0), jnp.ones(4, bool), 0.1).any()
+    assert not literal(zero, jnp.array(0.0), jnp.zeros(4, bool), 0.1).any()
+
+
 def test_the_bar_is_the_best_control_that_counts():
     control = jnp.array([[0.0, 0.4], [1.0, 1.0], [0.0, 0.0]])
     assert bar(control, jnp.array([True, False, True])) == pytest.approx(0.2)

@@ -8,7 +8,7 @@ import pytest
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.rl.test_grpo import FNS, P
 from touchr1_jax.rl.config import GRPOConfig, Paper
-from touchr1_jax.rl.gradient import Experience
+from touchr1_jax.rl.gradient import Experience, log_probs
 from touchr1_jax.rl.rollout import SampleConfig, sample_group
 from touchr1_jax.rl.trust_region import within_trust
 
@@ -35,6 +35,12 @@ def shorten(learn):
     """The parameters and sizes of an update of a given length along one direction, from one program."""
     along = lambda size: jax.tree.map(lambda a, d: a + size * d, BEFORE, DIRECTION)
     return jax.jit(lambda size: within_trust(FNS, CONFIG, BEFORE, along(size), learn, DELTA))
+
+
+def test_the_policy_that_sampled_has_the_sampled_log_probabilities(learn):
+    ours = jax.jit(lambda: log_probs(FNS, CONFIG, BEFORE, learn.batch, learn.rollout))()
+    mask = np.asarray(learn.rollout.mask)
+    np.testing.assert_allclose(np.asarray(ours)[mask], np.asarray(learn.rollout.log_prob)[mask], atol=1e-4)
 
 
 def test_a_short_update_stays(shorten):

@@ -14,6 +14,7 @@ from touchr1_jax.rewards import make_rewards, uniform_prior
 from touchr1_jax.rl.config import (
     Advantage,
     Cispo,
+    Dapo,
     DrGrpo,
     GRPOConfig,
     Gspo,
@@ -71,6 +72,34 @@ def test_published_variants_take_a_finite_step_of_their_own(plain, algorithm):
 
 
 @pytest.mark.slow
+def test_dynamic_sampling_learns_from_groups_that_differ():
+    """Half of the candidates ask for material, whose reward is the same for all."""
+    config = of(Dapo(), prompts=2, micro_prompts=2)
+    _, metrics = take(config, prompts=config.drawn)
+    assert config.drawn == 4
+    _, all_of_them = take(of(Dapo(candidates=1)))
+    assert all_of_them["degenerate_share"] >= 0.25
+    assert metrics["degenerate_share"] <= max(0, all_of_them["degenerate_share"] - 0.25)
+
+
+@pytest.mark.slow
+def test_inner_updates_leave_the_sampler_behind():
+    state, metrics = take(of(Paper(updates=3, clip_low=1e-3, clip_high=1e-3)))
+    one, first = take(of(Paper(clip_low=1e-3, clip_high=1e-3)))
+    assert first["clip_share"] == 0
+    assert metrics["clip_share"] > 0
+    assert metrics["loss"] == pytest.approx(float(first["loss"]), rel=1e-5)
+    assert moved(state) > moved(one)
+
+
+@pytest.mark.slow
+def test_importance_weights_of_an_exact_sampler_are_one(plain):
+    _, metrics = take(of(Paper(importance_cap=2.0)))
+    for name in ("loss", "grad_norm", "kl"):
+        np.testing.assert_allclose(metrics[name], plain[1][name], rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("buckets", [(), (2, 4)])
 def test_inner_updates_remember_the_learner_before_them(buckets):
     """With an exact sampler the learner before the first of three updates is the sampler, in every bucket."""
@@ -98,6 +127,23 @@ def test_a_state_without_a_reference_cannot_refresh_it():
     step = make_grpo_step(FNS, score, OPTIMIZER, config)
     with pytest.raises(ValueError, match="the state has no reference; make it with `start_state`"):
         step(state, tiny.question_batch(1, P), FROZEN)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("buckets", [(2,), (3, 5)])
+def test_buckets_change_nothing_but_the_time(buckets):
+    """Rollouts that end early, by banning all words but the end and one more."""
+    fns = dataclasses.replace(FNS, banned=~np.isin(np.arange(tiny.V), [1, 10]))
+    found = []
+    for config in (of(Paper()), of(Paper(), buckets=buckets)):
+        step = make_grpo_step(fns, score, OPTIMIZER, config)
+        state = start_state(tiny.shallow_params(0), OPTIMIZER, jax.random.key(2), config)
+        found.append(step(state, tiny.question_batch(1, P), FROZEN))
+    (whole, a), (cut, b) = found
+    for name in a:
+        np.testing.assert_allclose(a[name], b[name], rtol=1e-4, atol=1e-6, err_msg=name)
+    for x, y in zip(*map(jax.tree.leaves, (whole.params, cut.params)), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-6)
 
 
 def test_buckets_must_ascend_below_the_length():
@@ -136,6 +182,13 @@ def test_a_literal_bonus_is_a_term_of_the_reward():
     state = start_state(tiny.shallow_params(0), OPTIMIZER, jax.random.key(0), config)
     _, metrics = jax.eval_shape(step, state, tiny.question_batch(1, P), FROZEN)
     assert {"reward_right", "reward_tactile_use"} <= set(metrics)
+
+
+@pytest.mark.slow
+def test_the_entropy_bonus_raises_entropy():
+    _, before = take(of(Paper(entropy_weight=0.0, beta=0.0, gamma=0.0)), 4)
+    _, after = take(of(Paper(entropy_weight=1.0, beta=0.0, gamma=0.0)), 4)
+    assert after["entropy"] > before["entropy"] + 1e-3
 
 
 WEIGHTS = {"beta": 0.1, "gamma": 0.05, "entropy_weight": 0.02}

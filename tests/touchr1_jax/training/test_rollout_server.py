@@ -233,43 +233,76 @@ def test_what_passes_is_tried_again(training, stand_in, tmp_path, fault, changes
     assert [path for path, _ in stand_in.requests].count(COMPLETE) == 2 * P + 1
 
 
-def token(value):
-    """An answer whose first token is another one."""
-    return [changed(lambda c: c["token_ids"].__setitem__(0, value))]
-
-
-def chance(value):
-    """An answer whose first log-probability is another one."""
-    return [changed(lambda c: c["logprobs"]["token_logprobs"].__setitem__(0, value))]
-
-
 @pytest.mark.parametrize(
     ("faults", "message"),
     [
         ([refusing(500)] * 9, r"gave no answer in 2 tries, the last ended in status 500 \(no room\); start the server"),
         ([refusing(400)], r"refuses with status 400 \(no room\); start it with --enable-prompt-embeds"),
         ([truncated] * 9, r"gave no answer in 2 tries, the last ended in IncompleteRead"),
-        ([changed(lambda c: c.pop("token_ids"))], r"choices\[0\]\.token_ids of .* is None: must be a list of 1 to 5"),
-        ([changed(lambda c: c.pop("logprobs"))], r"choices\[0\]\.logprobs\.token_logprobs of .* is None: must"),
-        (token(512), r"token_ids of .* is 512 at one place: must be one of 512"),
-        (token(-1), r"token_ids of .* is -1 at one place"),
-        (token(1.5), r"token_ids of .* is 1\.5 at one place"),
-        (chance(math.nan), r"token_logprobs of .* is nan at one place: must be a finite log-probability"),
-        (chance(None), r"is None at one place"),
-        (chance(0.5), r"is 0\.5 at one place"),
-        ([changed(lambda c: c["logprobs"]["token_logprobs"].pop())], r"token_logprobs of .*: must be a list of \d log"),
-        ([changed(lambda c: c.update(index=7))], r"choices of .* is of 3 completions: must be of the group's 3, each"),
+        (
+            [changed(lambda c: c.pop("token_ids"))],
+            r"choices\[0\]\.token_ids of .* is None: must be a list of 1 to 5 ids",
+        ),
+        (
+            [changed(lambda c: c.pop("logprobs"))],
+            r"choices\[0\]\.logprobs\.token_logprobs of .* is None: must be a list",
+        ),
+        (
+            [changed(lambda c: c["token_ids"].__setitem__(0, 512))],
+            r"token_ids of .* is 512 at one place: must be one of 512",
+        ),
+        ([changed(lambda c: c["token_ids"].__setitem__(0, -1))], r"token_ids of .* is -1 at one place"),
+        ([changed(lambda c: c["token_ids"].__setitem__(0, 1.5))], r"token_ids of .* is 1\.5 at one place"),
+        (
+            [changed(lambda c: c["logprobs"]["token_logprobs"].__setitem__(0, math.nan))],
+            r"token_logprobs of .* is nan at one place: must be a finite log-probability",
+        ),
+        ([changed(lambda c: c["logprobs"]["token_logprobs"].__setitem__(0, None))], r"is None at one place"),
+        ([changed(lambda c: c["logprobs"]["token_logprobs"].__setitem__(0, 0.5))], r"is 0\.5 at one place"),
+        (
+            [changed(lambda c: c["logprobs"]["token_logprobs"].pop())],
+            r"token_logprobs of .*: must be a list of \d log-prob",
+        ),
+        (
+            [changed(lambda c: c.update(index=7))],
+            r"choices of .* is of 3 completions: must be of the group's 3, each with",
+        ),
         ([changed(lambda c: c["token_ids"].insert(0, c["token_ids"][-1]))], r"token_ids of .* must be"),
     ],
 )
 def test_a_failure_is_named_before_anything_is_changed(training, stand_in, tmp_path, faults, message):
     stand_in.faults = list(faults)
+    fails(training, drawing(training, stand_in, tmp_path, **QUICK), message)
+
+
+def fails(training, drawn, message: str) -> None:
+    """A step ends by one error, and its state is as before."""
     state = training.state()
     before = jax.tree.map(np.asarray, state.params)
     with pytest.raises(RolloutError, match=message):
-        drawing(training, stand_in, tmp_path, **QUICK)(state, training.batch)
+        drawn(state, training.batch)
     jax.tree.map(np.testing.assert_array_equal, before, state.params)
     assert state.step == 0
+
+
+def test_a_server_that_stays_silent_is_named(training, stand_in, tmp_path):
+    drawn = drawing(training, stand_in, tmp_path, tries=1, timeout_s=PATIENCE_S)
+    drawn(training.state(), training.batch)  # compiles what the server runs
+    stand_in.faults = [silent] * P
+    fails(training, drawn, "gave no answer in 1 tries, the last ended in TimeoutError")
+
+
+def test_a_server_without_the_adapters_is_named(training, stand_in, tmp_path, monkeypatch):
+    monkeypatch.setattr(stand_in, "served", Forgetful())
+    message = r"refuses with status 404 \(.*The model `touch-\w+` does not exist"
+    fails(training, drawing(training, stand_in, tmp_path, **QUICK), message)
+
+
+class Forgetful(dict):
+    """Adapters that are lost as soon as they are loaded."""
+
+    def __setitem__(self, name, value):
+        """Keep nothing."""
 
 
 def test_a_server_that_is_down_is_named_before_anything_is_made(training, tmp_path):

@@ -1,9 +1,12 @@
 """Configs as published and as newer libraries nest them, and what is refused."""
 
+import dataclasses
+import json
+
 import pytest
 
 from tests.touchr1_jax.models.qwen.cases import SHAPES, config_json, qwen3_json
-from touchr1_jax.models.qwen.config import QwenVisionConfig, released
+from touchr1_jax.models.qwen.config import QwenConfig, QwenVisionConfig, released
 from touchr1_jax.models.qwen.config_file import parse_config, read_config
 
 SEVEN_B = {
@@ -63,6 +66,11 @@ def test_released_config_is_read():
 @pytest.mark.parametrize("flat", [SEVEN_B, config_json(), config_json(tied=False)])
 def test_nested_config_is_the_flat_one(flat):
     assert parse_config(nested(flat)) == parse_config(flat)
+
+
+def test_directory_is_read(tmp_path):
+    (tmp_path / "config.json").write_text(json.dumps(SEVEN_B))
+    assert read_config(tmp_path) == released("7B")
 
 
 def test_missing_and_broken_files(tmp_path):
@@ -196,7 +204,11 @@ def test_released_qwen3_config_is_read():
         ("text_config", {"attention_bias": True}, "text_config.attention_bias is True: must be False"),
         ("text_config", {"head_dim": 96}, r"mrope_section is \[24, 20, 20\]: must sum to half of head_dim, 48"),
         ("text_config", {"head_dim": None}, "text_config.head_dim is None: must be a whole number above 0"),
-        ("text_config", {"num_hidden_layers": 3}, "names 3 layers: must be fewer than the decoder's"),
+        (
+            "text_config",
+            {"num_hidden_layers": 3},
+            "names 3 layers: must be fewer than the decoder's",
+        ),
         ("text_config", {"rope_scaling": {"mrope_section": [24, 20]}}, "must be three"),
         ("text_config", {"rope_scaling": {"mrope_section": [24, 20, 20], "mrope_interleaved": False}}, "must be True"),
         ("vision_config", {"deepstack_visual_indexes": [5, 24]}, r"is \[5, 24\]: must rise and lie in 0\.\.23"),
@@ -222,3 +234,9 @@ def test_a_missing_field_of_qwen3_is_named(part):
 def test_unknown_size_is_refused():
     with pytest.raises(ValueError, match="size is '14B': must be one of 3B, 7B"):
         released("14B")
+
+
+def test_configs_shrink_by_replacement():
+    small = dataclasses.replace(released("7B").vision, depth=2, full_layers=(1,))
+    assert isinstance(small, QwenVisionConfig)
+    assert isinstance(dataclasses.replace(released("7B"), vision=small), QwenConfig)

@@ -90,6 +90,12 @@ def test_bytes_must_fit_the_shape(tmp_path):
         read_header(tmp_path / "x")
 
 
+def test_entries_must_be_whole(tmp_path):
+    raw_file(tmp_path / "x", {"a": {"dtype": "F32", "shape": [4]}}, bytes(16))
+    with pytest.raises(ValueError, match="a lacks data_offsets"):
+        read_header(tmp_path / "x")
+
+
 def test_file_that_was_cut_off(tmp_path):
     raw_file(tmp_path / "x", {"a": {"dtype": "F32", "shape": [4], "data_offsets": [0, 16]}}, bytes(10))
     with pytest.raises(ValueError, match="was cut off: a ends at byte"):

@@ -201,7 +201,7 @@ def repeat_the_first(folder, weights):
         (
             lambda folder, _: (folder / INDEX).unlink(),
             FileNotFoundError,
-            "holds model-00001-of-00003.safetensors and not",
+            "holds model-00001-of-00003.safetensors and not .*index.json",
         ),
     ],
 )
