@@ -88,11 +88,3 @@ def test_gradients_are_finite_and_miss_what_is_not_selected(name, mask, x):
     gradient = jax.grad(lambda x: jnp.sum(STATISTICS[name](x, mask) * jnp.arange(1.0, 4)))(jnp.asarray(x))
     assert np.all(np.isfinite(gradient))
     assert np.all(np.asarray(gradient)[~mask] == 0)
-
-
-@pytest.mark.parametrize("name", STATISTICS)
-def test_jit_and_vmap_change_nothing(name):
-    statistic = STATISTICS[name]
-    np.testing.assert_allclose(jax.jit(statistic)(X, MASK), statistic(X, MASK), rtol=1e-6)
-    by_row = jnp.stack([statistic(x, m) for x, m in zip(X, MASK, strict=True)])
-    np.testing.assert_allclose(jax.vmap(statistic)(X, MASK), by_row, rtol=1e-6)

@@ -63,10 +63,7 @@ def test_new_labels_are_dealt_out_and_old_splits_stay(root):
     ("table", "message"),
     [
         ("object_id,hardness\ncup,1\n", "object_id is 'cup': must be an object of"),
-        (
-            "object_id,hardness\nobject_0,3\n",
-            "hardness of 'object_0' is '3': must be one of 0, 1, 2 (from soft",
-        ),
+        ("object_id,hardness\nobject_0,3\n", "hardness of 'object_0' is '3': must be one of 0, 1, 2 (from soft"),
         ("object_id,hardnes\nobject_0,1\n", "columns are ('object_id', 'hardnes'): must be object_id and any of"),
         ("object_id,hardness\nobject_0\n", "line 2: must have 2 cells"),
         ("object_id\nobject_0\nobject_0\n", "line 3: object_id 'object_0' appears twice"),

@@ -18,13 +18,7 @@ from sensors_io.exporters.arrays import export_arrays
 from sensors_io.exporters.exported import import_exported
 from sensors_io.exporters.lerobot import export_lerobot
 from sensors_io.exporters.selection import ExportError, Selected
-from sensors_io.records import (
-    IncompleteRecordsError,
-    MissingIndexError,
-    RecordsExistError,
-    RecordStore,
-    RecordWriter,
-)
+from sensors_io.records import IncompleteRecordsError, MissingIndexError, RecordsExistError, RecordStore, RecordWriter
 from tests.sensors_io import fakes
 from tests.sensors_io.checks import refused
 

@@ -19,16 +19,6 @@ def bump(x_0: float, y_0: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return z, -dx / 1.5**2 * z, -dy / 1.5**2 * z
 
 
-@pytest.mark.parametrize("at", [(160, 120), (5, 120), (310, 4)])
-def test_scale_is_right_at_centre_border_and_corner(at: tuple[float, float]) -> None:
-    z, g_x, g_y = bump(*at)
-    found = neumann(g_x.astype(np.float32), g_y.astype(np.float32), PITCH)
-    found = found - found[z < 1e-3].mean() + z[z < 1e-3].mean()
-    scale = (found * z).sum() / (z**2).sum()
-    assert scale == pytest.approx(1, abs=2e-3)
-    assert np.abs(found - z).max() < 2e-3
-
-
 def test_it_solves_the_least_squares_problem() -> None:
     """Random slopes, which no surface has, tell the boundary condition from every other."""
     rng = np.random.default_rng(0)

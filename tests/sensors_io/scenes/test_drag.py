@@ -11,12 +11,10 @@ from sensors_io.layer import Layer
 from sensors_io.scenes import drag, traction
 from sensors_io.scenes.hertz import Hertz
 from sensors_io.scenes.mindlin import half_space
-from sensors_io.scenes.motions import plan
 
 N, M, WINDOW_MM = 40, 80, 16.0
 SPACING = WINDOW_MM / N
 X = (np.arange(N) + 0.5) * SPACING - WINDOW_MM / 2
-RADIUS = np.hypot(X[None], X[:, None])
 GEL = Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=4.0)
 FRICTION, SHEAR_MODULUS = 0.5, 0.15
 
@@ -133,13 +131,3 @@ def test_a_twist_turns_the_gel_and_slips_at_its_torque() -> None:
     assert made.moment_nmm[-1, 2] == pytest.approx(3 * np.pi / 16 * FRICTION * 2.0 * a, rel=0.03)
     assert np.all(np.diff(made.moment_nmm[:, 2]) > -1e-3)
     np.testing.assert_allclose(made.force_n[:, :2], 0, atol=1e-3)
-
-
-def test_a_planned_slide_runs_through() -> None:
-    made_plan = plan("slide_x", 2.0)
-    poses = zip(made_plan.force_n, made_plan.slide_mm[:, 0], strict=True)
-    pressures = [_pressure(f, x) if f > 0 else np.zeros((N, N)) for f, x in poses]
-    made = _frames(pressures, made_plan.slide_mm, _layer())
-    assert made.converged.all()
-    assert np.abs(made.force_n[:, 0]).max() == pytest.approx(FRICTION * 2.0, rel=0.01)
-    np.testing.assert_array_equal(made.traction_mpa[made_plan.force_n == 0], 0)

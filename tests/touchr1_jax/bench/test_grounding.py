@@ -2,9 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 
 from touchr1_jax.bench import grounding
 from touchr1_jax.bench.metrics import accuracy
@@ -70,18 +67,9 @@ def test_every_control_is_asked_for():
 
 
 def test_conflict_and_revision_by_hand():
-    label = np.array([0, 1, 2, 2, 1])
-    prior = np.array([1, 1, 0, 0, -1])  # conflicts are questions 0, 2 and 3
-    answer = np.array([0, 1, 1, 0, 1])
-    assert grounding.conflict_accuracy(answer, label, prior).mean() == pytest.approx(100 / 3)
-    assert grounding.revision_rate(answer, label, prior).mean() == pytest.approx(200 / 3)
-    assert grounding.conflict_accuracy(answer, label, prior).items.tolist() == [0, 2, 3]
-
-
-@given(hnp.arrays(int, (3, 20), elements=st.integers(-1, 2)))
-def test_the_right_answer_to_a_conflict_is_a_revised_one(table):
-    answer, prior, label = table[0], table[1], np.abs(table[2])
-    conflict = grounding.conflict_accuracy(answer, label, prior)
-    revised = grounding.revision_rate(answer, label, prior)
-    assert np.all(conflict.values <= revised.values)
-    assert np.all(grounding.conflict_accuracy(prior, label, prior).values == 0)  # who follows sight
+    label = np.array([0, 1, 2, 2, 1, 0])
+    prior = np.array([1, 1, 0, 0, -1, 2])  # conflicts are questions 0, 2, 3 and 5
+    answer = np.array([0, 1, 1, 0, 1, -1])
+    assert grounding.conflict_accuracy(answer, label, prior).mean() == pytest.approx(25)
+    assert grounding.revision_rate(answer, label, prior).mean() == pytest.approx(50)
+    assert grounding.conflict_accuracy(answer, label, prior).items.tolist() == [0, 2, 3, 5]

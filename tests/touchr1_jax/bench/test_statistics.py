@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy import stats
 
 from touchr1_jax.bench import statistics
@@ -14,13 +12,6 @@ def test_bootstrap_of_two_clusters_is_exact():
     # Resamples are {aa, ab, bb} with probabilities ¼, ½, ¼, so the outer quantiles are the cluster means.
     interval = clustered_bootstrap(np.array([0.0, 0.0, 1.0]), np.array(["a", "a", "b"]))
     assert (interval.mean, interval.low, interval.high) == (pytest.approx(1 / 3), 0.0, 1.0)
-
-
-def test_repeating_every_value_of_an_object_does_not_narrow_the_interval():
-    values = np.random.default_rng(0).random(30)
-    once = clustered_bootstrap(values, np.arange(30), seed=1)
-    tenfold = clustered_bootstrap(np.repeat(values, 10), np.repeat(np.arange(30), 10), seed=1)
-    assert (once.low, once.high) == pytest.approx((tenfold.low, tenfold.high))
 
 
 def test_bootstrap_agrees_with_a_plain_loop():
@@ -35,26 +26,6 @@ def test_bootstrap_agrees_with_a_plain_loop():
         means.append(np.mean([values[index][strata[index] == s].mean() for s in np.unique(strata[index])]))
     assert (got.low, got.high) == pytest.approx(np.quantile(means, (0.025, 0.975)), abs=0.02)
     assert got.mean == pytest.approx(np.mean([values[strata == s].mean() for s in (0, 1)]))
-
-
-def test_bootstrap_covers_the_mean_about_as_often_as_it_says():
-    rng = np.random.default_rng(0)
-    hits = 0
-    for trial in range(200):
-        effect = rng.normal(size=40)
-        values = np.repeat(effect, 5) + 0.3 * rng.normal(size=200)
-        interval = clustered_bootstrap(values, np.repeat(np.arange(40), 5), resamples=500, seed=trial)
-        hits += interval.low <= 0 <= interval.high
-    assert 0.88 <= hits / 200 <= 0.99
-
-
-def test_paired_difference_is_tighter_than_its_parts():
-    rng = np.random.default_rng(0)
-    hard = rng.random(50)
-    a, b = hard + 0.1, hard
-    interval = clustered_bootstrap(a - b, np.arange(50))
-    assert interval.excludes_zero
-    assert interval.low == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize(
@@ -84,27 +55,13 @@ def test_interquartile_mean_drops_a_quarter_at_either_end():
     assert statistics.interquartile_mean(scores) == pytest.approx(stats.trim_mean(scores, 0.25))
 
 
-def test_stratified_bootstrap_resamples_inside_each_task():
-    scores = np.tile([1.0, 2.0, 3.0, 4.0], (5, 1))  # no spread over runs: nothing to resample
-    interval = statistics.stratified_bootstrap_iqm(scores)
-    assert (interval.low, interval.mean, interval.high) == (2.5, 2.5, 2.5)
-    spread = statistics.stratified_bootstrap_iqm(scores + np.arange(5)[:, None])
-    assert spread.low < spread.mean < spread.high
-
-
-def test_probability_of_improvement_by_hand():
-    better, than = np.array([[1.0], [3.0]]), np.array([[2.0], [1.0]])
-    assert statistics.probability_of_improvement(better, than) == pytest.approx((0 + 0.5 + 1 + 1) / 4)
-    assert statistics.probability_of_improvement(than, than) == 0.5
-    with pytest.raises(ValueError, match="tasks"):
-        statistics.probability_of_improvement(np.ones((2, 1)), np.ones((2, 2)))
-
-
 def test_probability_of_improvement_is_mann_whitneys_statistic():
     rng = np.random.default_rng(0)
     better, than = rng.integers(0, 6, (7, 3)).astype(float), rng.integers(0, 5, (4, 3)).astype(float)
     tasks = [stats.mannwhitneyu(better[:, t], than[:, t]).statistic / (7 * 4) for t in range(3)]
     assert statistics.probability_of_improvement(better, than) == pytest.approx(np.mean(tasks))
+    with pytest.raises(ValueError, match="tasks"):
+        statistics.probability_of_improvement(np.ones((2, 1)), np.ones((2, 2)))
 
 
 def test_interval_of_the_improvement_agrees_with_a_plain_loop():
@@ -145,14 +102,6 @@ def test_sampled_sign_flips_agree_with_a_t_test():
     differences = np.random.default_rng(0).normal(0.4, 1, 40)
     assert statistics.sign_flip_test(differences) == pytest.approx(stats.ttest_1samp(differences, 0).pvalue, abs=0.01)
     assert statistics.sign_flip_test(np.ones(40)) == pytest.approx(1 / 20_001)
-
-
-@given(st.lists(st.floats(-5, 5), min_size=1, max_size=8))
-def test_sign_flip_p_value_is_symmetric_and_bounded(differences):
-    d = np.array(differences)
-    p = statistics.sign_flip_test(d)
-    assert min(1.0, 2.0 ** (1 - len(d))) <= p <= 1
-    assert p == statistics.sign_flip_test(-d)
 
 
 def test_a_crossed_test_of_answers_that_are_alike_is_a_t_test_over_seeds_or_over_objects():
@@ -196,14 +145,7 @@ def test_kappa_by_hand():
     # 20 yes/yes, 15 no/no, 5 + 10 apart of 50: observed .7, expected .5 (a textbook case)
     a = np.repeat([1, 1, 0, 0], [20, 5, 10, 15])
     b = np.repeat([1, 0, 1, 0], [20, 5, 10, 15])
-    assert statistics.cohens_kappa(a, b, 2) == pytest.approx(0.4)
-
-
-def test_kappa_of_equal_independent_and_opposite_raters():
-    a = np.array([0, 0, 1, 1, 2, 2])
-    assert statistics.cohens_kappa(a, a, 3) == 1.0
-    assert statistics.cohens_kappa(np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1]), 2) == pytest.approx(0)
-    assert statistics.cohens_kappa(np.array([0, 1]), np.array([1, 0]), 2) == -1.0
+    assert statistics.cohens_kappa(a, b, 2) == pytest.approx(0.4) == statistics.cohens_kappa(b, a, 2)
 
 
 def test_quadratic_weights_forgive_the_neighbour():

@@ -10,14 +10,7 @@ import pytest
 
 from tests.touchr1_jax.distributed.sixteen import DECODER, GRPO, PROMPT, tiny_step
 from touchr1_jax.distributed.abstract import PromptShape, abstract_grpo
-from touchr1_jax.distributed.memory import (
-    Compiled,
-    GRPOShape,
-    cache_bytes,
-    counted_peak,
-    grpo_bytes,
-    saved_bytes,
-)
+from touchr1_jax.distributed.memory import Compiled, GRPOShape, cache_bytes, counted_peak, grpo_bytes, saved_bytes
 from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.models.lora import LoraConfig
 from touchr1_jax.models.qwen.config import released

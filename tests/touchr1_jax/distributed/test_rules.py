@@ -12,13 +12,7 @@ from jax.sharding import PartitionSpec as P
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.distributed.problems import PROBLEMS
 from touchr1_jax.distributed.mesh import MeshConfig
-from touchr1_jax.distributed.rules import (
-    activation_axes,
-    batch_shardings,
-    gathered_shardings,
-    rule,
-    state_shardings,
-)
+from touchr1_jax.distributed.rules import activation_axes, batch_shardings, gathered_shardings, rule, state_shardings
 from touchr1_jax.models.frame_decoder import FrameDecoder, FrameDecoderConfig
 from touchr1_jax.models.lora import LoraConfig, init_adapters
 from touchr1_jax.models.qwen.config import released

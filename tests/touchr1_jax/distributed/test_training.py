@@ -24,11 +24,7 @@ MESHES = {"data": "8,1,1", "fsdp": "1,8,1", "tensor": "1,1,4", "mixed": "2,2,2"}
 def start(problem: str, mesh: str, directory: Path, devices: int, *process: str) -> subprocess.Popen:
     """A worker on simulated devices, compiling quickly as the tests do."""
     flags = f"{OLDER_LOOPS} --xla_force_host_platform_device_count={devices}"
-    environment = {
-        "XLA_FLAGS": flags,
-        "JAX_PLATFORMS": "cpu",
-        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
-    }
+    environment = {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
     command = [sys.executable, "-m", "tests.touchr1_jax.distributed.worker", problem, mesh, str(directory)]
     return subprocess.Popen(
         [*command, *(("--process", *process) if process else ())],

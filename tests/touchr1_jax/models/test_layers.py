@@ -115,6 +115,10 @@ def test_two_masked_scores_differ_by_zero():
     ("make", "message"),
     [
         (lambda: DecoderConfig(vocab_size=0, num_heads=0), "num_heads is 0: must be at least 1"),
+        (
+            lambda: DecoderConfig(vocab_size=8, num_heads=3, num_kv_heads=2),
+            "num_heads is 3: must be a multiple of num_kv_heads 2",
+        ),
         (lambda: TactileViTConfig(sensors=1, width=97), "width 97 must be a multiple of num_heads 3"),
         (lambda: TactileViTConfig(sensors=1, patch_cells=0), "patch_cells is 0: must be at least 1"),
         (lambda: DecoderConfig(vocab_size=9, num_layers=0), "num_layers is 0: must lie in 1 … 1000"),

@@ -1,6 +1,6 @@
 import pytest
 
-from tests.touchr1_jax.rewards.examples import constant, make_parsed, make_target
+from tests.touchr1_jax.rewards.examples import make_parsed, make_target
 from touchr1_jax.rewards.accuracy import accuracy
 
 
@@ -36,18 +36,3 @@ def test_several_attributes_earn_the_mean_over_the_asked():
 @pytest.mark.parametrize("answer", [-1, 0, 1])
 def test_unknown_label_earns_nothing(answer):
     assert accuracy(make_parsed((answer, 0, 0)), make_target(label=(-1, 0, 0))) == 0
-
-
-def mean_credit(level: int, prior: tuple[float, ...]) -> float:
-    """Mean credit of a constant answer."""
-    earned = [accuracy(constant(level), make_target(label=(y, 0, 0))) for y in range(3)]
-    return sum(p * float(reward) for p, reward in zip(prior, earned, strict=True))
-
-
-def test_constant_middle_beats_the_ends_on_uniform_labels():
-    assert [mean_credit(level, (1 / 3,) * 3) for level in range(3)] == pytest.approx([1.4 / 3, 0.6, 1.4 / 3])
-
-
-@pytest.mark.parametrize("prior", [(0.5, 0.2, 0.3), (0.5, 0.3, 0.2), (0.2, 0.1, 0.7), (0.45, 0.05, 0.5)])
-def test_when_the_middle_beats_the_lowest_level(prior):
-    assert (mean_credit(1, prior) > mean_credit(0, prior)) == (prior[0] < prior[1] + 2 / 3 * prior[2])

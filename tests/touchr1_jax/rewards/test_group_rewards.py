@@ -21,8 +21,7 @@ def test_the_penalty_grows_over_the_last_fifth_of_twenty_tokens(length, truncate
 
 
 @pytest.mark.parametrize(
-    ("tokens", "earned"),
-    [([[1, 2], [1, 2], [1, 3]], [0.5, 0.5, 1.0]), ([[1, 2], [1, 2]], [0, 0]), ([[4, 4]], [0])],
+    ("tokens", "earned"), [([[1, 2], [1, 2], [1, 3]], [0.5, 0.5, 1.0]), ([[1, 2], [1, 2]], [0, 0]), ([[4, 4]], [0])]
 )
 def test_diversity_is_the_share_of_the_others_that_differ(tokens, earned):
     parsed = jax.tree.map(lambda x: jnp.stack([x] * len(tokens)), make_parsed())

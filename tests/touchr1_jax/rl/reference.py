@@ -76,24 +76,17 @@ def surrogate(kind: str, log_prob, old, mask, advantage, low: float, high: float
     return {"value": value, "clipped": clipped, "gradient": gradient}
 
 
-def loss(algorithm, *, prompts: int, longest: int, **x: np.ndarray) -> tuple[float, dict[str, NDArray]]:
-    """The loss of a micro-batch and its averages, prompt by prompt, under the clipped surrogate of single tokens."""
+def loss(algorithm, *, prompts: int, **x: np.ndarray) -> tuple[float, dict[str, NDArray]]:
+    """The loss of a micro-batch and its averages, prompt by prompt, under weighted and clipped surrogates of tokens."""
     total, found = 0.0, {"surrogate": [], "kl": [], "grounding": [], "entropy": []}
     for p, weight in enumerate(x["weight"]):
         mask, a = x["mask"][p], x["advantage"][p][:, None]
         ratio = np.exp(x["log_prob"][p] - x["old"][p])
         objective = np.minimum(ratio * a, np.clip(ratio, 1 - algorithm.clip_low, 1 + algorithm.clip_high) * a)
-        if algorithm.importance_cap is not None:
-            objective = objective * np.minimum(np.exp(x["old"][p] - x["sampler"][p]), algorithm.importance_cap)
-        sums = lambda y, mask=mask: np.where(mask, y, 0).sum(1)
-        per_rollout = lambda y, mask=mask, sums=sums: (sums(y) / mask.sum(1)).mean()
-        average = {
-            "rollout": per_rollout,
-            "token": lambda y, mask=mask, sums=sums: sums(y).sum() / mask.sum(),
-            "length": lambda y, sums=sums: sums(y).mean() / longest,
-        }[algorithm.average.value]
+        objective = objective * np.minimum(np.exp(x["old"][p] - x["sampler"][p]), algorithm.importance_cap)
+        average = lambda y, mask=mask: (np.where(mask, y, 0).sum(1) / mask.sum(1)).mean()
         surrogate, kl = average(objective), average(x["reference_kl"][p])
-        grounding, entropy = per_rollout(x["grounding"][p]), per_rollout(x["entropy"][p])
+        grounding, entropy = average(x["grounding"][p]), average(x["entropy"][p])
         grounded = min(algorithm.gamma * grounding, algorithm.grounding_budget or np.inf)
         explored = algorithm.entropy_weight * min(entropy, algorithm.entropy_floor_nat or np.inf)
         total += weight * surrogate + (grounded - algorithm.beta * kl + explored) / prompts

@@ -12,13 +12,7 @@ from tests.touchr1_jax import explored
 from tests.touchr1_jax.explored import BANK, BUDGET, POLICY, SHALLOW, N, T
 from touchr1_jax.models.active_policy import Explored
 from touchr1_jax.models.policy import Policy
-from touchr1_jax.rl.active import (
-    ActiveEngine,
-    ActiveInputs,
-    check_active_config,
-    make_active_step,
-    mutual_information,
-)
+from touchr1_jax.rl.active import ActiveEngine, ActiveInputs, check_active_config, make_active_step, mutual_information
 from touchr1_jax.rl.config import DrGrpo, GRPOConfig, Norm, Paper, Stable
 from touchr1_jax.rl.gradient import Experience, grpo_gradient
 from touchr1_jax.rl.grpo import start_state

@@ -1,14 +1,12 @@
 """The loss on arrays against NumPy, and its terms by hand."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from tests.touchr1_jax.rl import reference
-from touchr1_jax.rl.config import Average, GRPOConfig, Paper, Stable, Surrogate
+from touchr1_jax.rl.config import Average, GRPOConfig, Paper, Surrogate
 from touchr1_jax.rl.losses import (
     TokenTerms,
     at_most,
@@ -20,20 +18,17 @@ from touchr1_jax.rl.losses import (
     expected_score,
     group_mean,
     grpo_loss,
-    reference_kl,
     surrogate,
-    token_log_probs,
     token_terms,
 )
 
 RATIO = np.array([0.5, 0.9, 1.0, 1.1, 2.0])
 
 
-def surrogate_of(log_prob, advantage: float, *, low: float = 0.2, high: float = 0.3, kind=Surrogate.TOKEN, mask=True):
+def surrogate_of(log_prob, advantage: float):
     """Value, clip flag and d Σ value / d log π of one rollout whose old log-probabilities are 0."""
-    algorithm = Paper(surrogate=kind, clip_low=low, clip_high=high)
-    zero = jnp.zeros(len(log_prob))
-    run = lambda x: surrogate(algorithm, x, zero, jnp.broadcast_to(jnp.array(mask), zero.shape), jnp.array(advantage))
+    algorithm, zero = Paper(clip_low=0.2, clip_high=0.3), jnp.zeros(len(log_prob))
+    run = lambda x: surrogate(algorithm, x, zero, zero == 0, jnp.array(advantage))
     x = jnp.asarray(log_prob, jnp.float32)
     return *run(x), jax.grad(lambda x: run(x)[0].sum())(x)
 
@@ -60,21 +55,6 @@ def test_far_ratios_stay_finite(gap):
     value, _, gradient = surrogate_of([gap], -1.0)
     assert jnp.isfinite(value).all()
     assert jnp.isfinite(gradient).all()
-
-
-def test_sequence_ratio_by_hand():
-    """Two tokens, ratios e^.2 and 1: s = e^.1, clipped at 1.05 for a good answer, free for a bad one."""
-    sequence = {"kind": Surrogate.SEQUENCE, "low": 0.05, "high": 0.05, "mask": [True, True, False]}
-    good, bad = (surrogate_of([0.2, 0.0, 9.0], a, **sequence) for a in (2.0, -2.0))
-    np.testing.assert_allclose(good[0][:2], [2.1, 2.1], rtol=1e-6)
-    assert good[1][:2].all()
-    np.testing.assert_allclose(bad[0][:2], -2 * np.exp(0.1), rtol=1e-6)
-
-
-def test_cispo_keeps_the_gradient_of_clipped_tokens():
-    _, clipped, gradient = surrogate_of(np.log([0.5, 1.0, 4.0]), 1.5, low=1.0, high=0.5, kind=Surrogate.CISPO)
-    np.testing.assert_allclose(gradient, 1.5 * np.array([0.5, 1, 1.5]), rtol=1e-6)
-    np.testing.assert_array_equal(clipped, [False, False, True])
 
 
 RNG = np.random.default_rng(3)
@@ -107,16 +87,6 @@ def test_a_batch_whose_rollouts_are_all_masked_has_a_mean_of_0():
     np.testing.assert_array_equal(group_mean(Average.BATCH, jnp.ones((2, 3, 4)), mask, divisor(config, mask)), [0, 0])
 
 
-def test_group_means_by_hand():
-    x = jnp.array([[1.0, 2, 3, 4], [10.0, -99, -99, -99]])
-    mask = jnp.array([[True] * 4, [True] + [False] * 3])
-    means = {Average.ROLLOUT: (2.5 + 10) / 2, Average.TOKEN: 20 / 5, Average.LENGTH: (10 / 5 + 10 / 5) / 2}
-    for kind, expected in means.items():
-        np.testing.assert_allclose(
-            group_mean(kind, jnp.stack([x, 2 * x]), jnp.stack([mask, mask]), 5), [expected, 2 * expected]
-        )
-
-
 def loss_arguments() -> dict[str, np.ndarray]:
     """Random arguments of the loss of three prompts of four rollouts; prompt 1 does not count."""
     rng = np.random.default_rng(0)
@@ -135,26 +105,23 @@ def loss_arguments() -> dict[str, np.ndarray]:
     }
 
 
-OPTIONS = {
-    "published": Paper(beta=0.1, gamma=0.05),
-    "mean over tokens": Paper(beta=0.1, gamma=0.05, average=Average.TOKEN),
-    "constant length": Paper(beta=0.1, gamma=0.05, average=Average.LENGTH),
-    "entropy": Paper(gamma=0.0, entropy_weight=0.1),
-    "entropy up to a floor": Paper(gamma=0.0, entropy_weight=0.1, entropy_floor_nat=1.0),
-    "grounding up to a budget": Paper(gamma=0.1, grounding_budget=0.15),
-    "importance weights up to a cap": Paper(importance_cap=1.2),
-}
+LOUD = {"beta": 0.1, "entropy_weight": 0.1, "importance_cap": 1.2}
 
 
-@pytest.mark.parametrize("algorithm", OPTIONS.values(), ids=OPTIONS)
-def test_loss_is_its_formula(algorithm):
+@pytest.mark.parametrize(
+    "algorithm",
+    [Paper(gamma=0.05, **LOUD), Paper(gamma=0.1, grounding_budget=0.15, entropy_floor_nat=1.0, **LOUD)],
+    ids=["free", "up to bounds"],
+)
+def test_loss_and_parts_are_their_formulas(algorithm):
+    """The other options are those of `test_reference_gradients`."""
     arguments = loss_arguments()
     config = GRPOConfig(prompts=4, micro_prompts=4, group=4, length=9, algorithm=algorithm)
     arrays = {name: jnp.asarray(x, bool if x.dtype == bool else jnp.float32) for name, x in arguments.items()}
     terms = TokenTerms(*(arrays.pop(name) for name in ("log_prob", "reference_kl", "grounding", "entropy")))
     loss, parts = grpo_loss(terms, **arrays, config=config)
-    expected, means = reference.loss(algorithm, prompts=4, longest=9, **arguments)
-    assert float(loss) == pytest.approx(expected, rel=1e-5)
+    expected, means = reference.loss(algorithm, prompts=4, **arguments)
+    assert float(loss) == pytest.approx(expected, rel=1e-5, abs=1e-7)  # terms of .1 nearly cancel
     for name, value in means.items():
         np.testing.assert_allclose(parts[name], value, rtol=1e-5, err_msg=name)
     mask = arguments["mask"]
@@ -170,59 +137,33 @@ def test_a_bound_cuts_the_gradient_off():
     assert at_most(jnp.array(3.0), None) == 3.0
 
 
-@pytest.fixture
-def branches():
-    """Scores [T, V] under the true and the perturbed touch."""
+def test_cap_bounds_the_grounding_of_each_token_and_cuts_its_gradient():
     rng = np.random.default_rng(0)
-    return [jnp.asarray(rng.normal(0, 2, (4, 6)), jnp.float32) for _ in range(2)]
+    branches = [jnp.asarray(rng.normal(0, 2, (4, 6)), jnp.float32) for _ in range(2)]
 
+    def grounding(p, q, cap=None):
+        log_p, log_q = jax.nn.log_softmax(p), jax.nn.log_softmax(q)
+        return token_terms(Paper(grounding_cap_nat=cap), jnp.zeros(4, jnp.int32), log_p, None, log_q).grounding
 
-def grounding(p, q, **options):
-    """Grounding of each of four tokens, from scores."""
-    log_p, log_q = jax.nn.log_softmax(p), jax.nn.log_softmax(q)
-    return token_terms(Paper(**options), jnp.zeros(4, jnp.int32), log_p, None, log_q).grounding
-
-
-def test_grounding_is_the_exact_kl_and_zero_when_nothing_is_perturbed(branches):
-    p, q = (np.asarray(jax.nn.softmax(x), np.float64) for x in branches)
-    np.testing.assert_allclose(grounding(*branches), (p * np.log(p / q)).sum(-1), rtol=1e-5)
-    assert not grounding(branches[0], branches[0]).any()
-
-
-def test_cap_bounds_the_grounding_of_each_token_and_cuts_its_gradient(branches):
     free = grounding(*branches)
     cap = float(jnp.median(free))
-    np.testing.assert_allclose(grounding(*branches, grounding_cap_nat=cap), np.minimum(free, cap), rtol=1e-6)
-    gradient = jax.grad(lambda p, q: grounding(p, q, grounding_cap_nat=cap).sum())(*branches)
+    np.testing.assert_allclose(grounding(*branches, cap), np.minimum(free, cap), rtol=1e-6)
+    gradient = jax.grad(lambda p, q: grounding(p, q, cap).sum())(*branches)
     np.testing.assert_array_equal(jnp.any(gradient != 0, -1), free < cap)
 
 
-def test_stopped_branch_has_no_gradient_and_the_free_one_has(branches):
-    gradient = lambda stop: jax.grad(lambda p, q: grounding(p, q, grounding_stop_masked=stop).sum(), (0, 1))(*branches)
-    (true_free, masked_free), (true_stopped, masked_stopped) = gradient(False), gradient(True)
-    np.testing.assert_array_equal(true_free, true_stopped)
-    assert not masked_stopped.any()
-    q, p = jax.nn.softmax(branches[1]), jax.nn.softmax(branches[0])
-    np.testing.assert_allclose(masked_free, q - p, atol=1e-5)  # ∇_q KL(p ‖ softmax q)
-
-
-def test_terms_of_policies_that_are_not_run_are_zero(branches):
-    terms = token_terms(Paper(), jnp.zeros(4, jnp.int32), jax.nn.log_softmax(branches[0]), None, None)
+def test_terms_of_policies_that_are_not_run_are_zero():
+    log_p = jax.nn.log_softmax(jnp.asarray(RNG.normal(0, 2, (4, 6)), jnp.float32))
+    terms = token_terms(Paper(), jnp.zeros(4, jnp.int32), log_p, None, None)
     assert not terms.reference_kl.any()
     assert not terms.grounding.any()
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.1])
-def test_entropy_has_a_gradient_where_it_is_paid_for(branches, weight):
-    algorithm, tokens = Paper(entropy_weight=weight), jnp.zeros(4, jnp.int32)
-    of = lambda x: token_terms(algorithm, tokens, jax.nn.log_softmax(x), None, None).entropy.sum()
-    assert bool(jax.grad(of)(branches[0]).any()) is (weight > 0)
-
-
-def test_token_log_probs_and_entropy_by_hand():
-    log_p = jnp.log(jnp.array([[0.5, 0.25, 0.25], [1.0, 0.0, 0.0]]).clip(1e-30))
-    np.testing.assert_allclose(token_log_probs(log_p, jnp.array([1, 0])), [np.log(0.25), 0], rtol=1e-6)
-    np.testing.assert_allclose(entropy(log_p), [1.5 * np.log(2), 0], atol=1e-6)
+def test_entropy_has_a_gradient_where_it_is_paid_for(weight):
+    algorithm, scores = Paper(entropy_weight=weight), jnp.asarray(RNG.normal(0, 2, (4, 6)), jnp.float32)
+    of = lambda x: token_terms(algorithm, jnp.zeros(4, jnp.int32), jax.nn.log_softmax(x), None, None).entropy.sum()
+    assert bool(jax.grad(of)(scores).any()) is (weight > 0)
 
 
 def test_entropy_is_the_distance_from_the_uniform():
@@ -232,17 +173,7 @@ def test_entropy_is_the_distance_from_the_uniform():
     np.testing.assert_allclose(entropy(log_p), np.log(3) - exact_kl(log_p, uniform), rtol=1e-5)
 
 
-THETA = jnp.asarray(RNG.normal(size=6), jnp.float32)
-REFERENCE = jax.nn.log_softmax(jnp.asarray(RNG.normal(size=6), jnp.float32))
 ESTIMATORS = ("k1", "k2", "k3")
-forward = lambda theta: exact_kl(jax.nn.log_softmax(theta), REFERENCE)
-reverse = lambda theta: exact_kl(REFERENCE, jax.nn.log_softmax(theta))
-
-
-def test_exact_kl_by_hand():
-    """KL((½, ½) ‖ (¼, ¾)) = ½ log 2 + ½ log ⅔."""
-    ours = exact_kl(jnp.log(jnp.array([0.5, 0.5])), jnp.log(jnp.array([0.25, 0.75])))
-    np.testing.assert_allclose(ours, 0.5 * np.log(2) + 0.5 * np.log(2 / 3), rtol=1e-6)
 
 
 def test_exact_kl_of_equal_distributions_is_zero_even_with_banned_tokens():
@@ -262,22 +193,6 @@ def test_estimators_by_hand(estimator, value):
     np.testing.assert_allclose(ours, value, rtol=1e-6)
 
 
-@pytest.mark.parametrize("estimator", ["k1", "k3"])
-def test_k1_and_k3_are_unbiased_values(estimator):
-    log_p = jax.nn.log_softmax(THETA)
-    np.testing.assert_allclose(jnp.exp(log_p) @ estimated_kl(log_p, REFERENCE, estimator), forward(THETA), rtol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("estimator", "divergence"), [("k1", lambda theta: 0 * theta[0]), ("k2", forward), ("k3", reverse)], ids=ESTIMATORS
-)
-def test_expected_gradient_of_an_estimator(estimator, divergence):
-    """E_{v ~ π} ∇ k(v), by enumerating the vocabulary; sampling itself carries no gradient (arXiv 2510.01555)."""
-    of = lambda theta: estimated_kl(jax.nn.log_softmax(theta), REFERENCE, estimator)
-    np.testing.assert_allclose(jax.nn.softmax(THETA) @ jax.jacobian(of)(THETA), jax.grad(divergence)(THETA), atol=1e-6)
-    assert jnp.abs(jax.grad(reverse)(THETA) - jax.grad(forward)(THETA)).max() > 0.05
-
-
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("gap", [-1e9, -1e3, 1e3, 1e9])
 def test_clamp_keeps_far_ratios_finite(estimator, gap):
@@ -293,18 +208,6 @@ def test_clamp_leaves_near_ratios_alone():
 def test_k3_keeps_its_digits_near_zero():
     """exp(x) − 1 − x would round x = 1e-3 to two digits."""
     np.testing.assert_allclose(estimated_kl(jnp.array(0.0), jnp.array(1e-3), "k3"), 5.0016671e-7, rtol=1e-3)
-
-
-@pytest.mark.parametrize("estimator", [*ESTIMATORS, "exact"])
-def test_reference_kl_by_the_configured_estimator(estimator):
-    rng = np.random.default_rng(0)
-    log_p, log_ref = (jax.nn.log_softmax(jnp.asarray(rng.normal(size=(2, 4, 5)), jnp.float32)) for _ in range(2))
-    tokens = jnp.asarray(rng.integers(0, 5, (2, 4)))
-    ours = token_terms(dataclasses.replace(Stable(), kl=estimator), tokens, log_p, log_ref, None).reference_kl
-    here, there = token_log_probs(log_p, tokens), token_log_probs(log_ref, tokens)
-    expected = exact_kl(log_p, log_ref) if estimator == "exact" else estimated_kl(here, there, estimator)
-    np.testing.assert_array_equal(ours, expected)
-    np.testing.assert_array_equal(reference_kl(estimator, log_p, log_ref, tokens), expected)
 
 
 DRIFTED = np.array([[[2.0, 0.5, 9.0], [3.0, 3.0, 1.0]]])
@@ -343,24 +246,6 @@ def test_the_expected_score_by_hand(cap, slopes):
     algorithm = Paper(score_centering=2, importance_cap=cap)
     found = jax.grad(lambda x: expected_score(algorithm, x, log_q))(log_p)
     np.testing.assert_allclose(found, slopes, atol=1e-6)
-
-
-@pytest.mark.parametrize("cap", [None, 1.2])
-@pytest.mark.parametrize("k", [3, 6])
-def test_centered_scores_have_no_mean_under_the_sampler(cap, k):
-    """Of all six words, or of three where the sampler's others are as likely among themselves as the learner's."""
-    rng = np.random.default_rng(0)
-    logits, algorithm = jnp.asarray(rng.normal(size=6), jnp.float32), Paper(score_centering=k, importance_cap=cap)
-    p, q = np.asarray(jax.nn.softmax(logits)), np.zeros(6)
-    q[:k] = rng.dirichlet(np.ones(k)) * (1.0 if k == 6 else 0.8)
-    q[k:] = 0.2 * p[k:] / p[k:].sum()
-    w = np.ones(6) if cap is None else np.minimum(p / q, cap)
-    score_of = jax.jacobian(jax.nn.log_softmax)(logits)
-    subtracted = jax.grad(
-        lambda x: expected_score(algorithm, jax.nn.log_softmax(x)[:k], jnp.log(jnp.asarray(q[:k], jnp.float32)))
-    )(logits)
-    assert np.abs(subtracted).max() > 0.01
-    np.testing.assert_allclose(subtracted, (q * w) @ np.asarray(score_of), atol=2e-6)
 
 
 @pytest.mark.parametrize(

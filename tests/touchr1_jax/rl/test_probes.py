@@ -66,12 +66,6 @@ def train(step, batch, steps: int) -> jax.Array:
     return jax.nn.softmax(first)[jnp.arange(P), PAYS[jnp.max(batch.target.label, -1)]]
 
 
-def test_bandit_is_solved(step):
-    batch = batch_of(np.arange(P) % 2, np.zeros(P, int))
-    assert train(step, batch, 0).mean() < 0.2
-    assert train(step, batch, 80).mean() >= 0.99
-
-
 def test_touch_is_read(step):
     """Nothing but the pattern of the streams says which token is paid; without it one half is the best."""
     pattern = np.arange(P) % 2

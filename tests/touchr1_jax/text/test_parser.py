@@ -1,13 +1,12 @@
 import dataclasses
 
-import chex
 import hypothesis
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.touchr1_jax.text.vocabularies import LANGUAGES, character_level, make_tokenizer, spell, token_sequences
+from tests.touchr1_jax.text.vocabularies import LANGUAGES, character_level, make_tokenizer, token_sequences
 from touchr1_jax.text.language import HARDNESS, MATERIAL, TOUCH_LANGUAGE, Attribute
 from touchr1_jax.text.oracle import read
 from touchr1_jax.text.parser import compile_parser
@@ -162,42 +161,6 @@ def test_truncated_answer_is_read_as_it_stands():
     assert not parse(GOOD[:-1], end=False).formatted
 
 
-def test_listing_all_levels_or_repeating_tags_gains_nothing():
-    listed = GOOD.replace("> hard <", "> soft firm hard <")
-    assert hardness(listed)[2] == -1
-    guesses = "".join(f"<conclude> {word} </conclude>" for word in ("soft", "firm", "hard"))
-    assert hardness(GOOD.replace("<conclude> hard </conclude>", guesses))[2:] == (-1, False)
-
-
-def test_tokens_after_the_end_do_not_matter():
-    tokenizer = word_level(TOUCH_LANGUAGE)
-    parser = jax.jit(compile_parser(TOUCH_LANGUAGE, tokenizer))
-    ids = [*tokenizer.encode(GOOD), *tokenizer.end_ids]
-    expected = parser(jnp.array(ids))
-    for filler in range(tokenizer.vocab_size):
-        chex.assert_trees_all_equal(parser(jnp.array(ids + [filler] * 7)), expected)
-
-
-def test_how_a_text_is_cut_into_tokens_does_not_matter():
-    tokenizer = make_tokenizer("straddling", TOUCH_LANGUAGE)
-    parser = jax.jit(compile_parser(TOUCH_LANGUAGE, tokenizer))
-    expected = parse(GOOD)
-    for seed in range(50):
-        ids = spell(tokenizer.pieces, GOOD, seed)
-        parsed = parser(jnp.array(ids + [tokenizer.end_ids[0]] * (len(GOOD) + 1 - len(ids))))
-        chex.assert_trees_all_equal(parsed.replace(length=0), expected.replace(length=0))
-
-
-def test_jit_and_vmap_change_nothing():
-    tokenizer = make_tokenizer("straddling", TOUCH_LANGUAGE)
-    parser = compile_parser(TOUCH_LANGUAGE, tokenizer)
-    rng = np.random.default_rng(0)
-    tokens = jnp.array(rng.integers(0, tokenizer.vocab_size, (3, 30)), jnp.int32)
-    batched = jax.jit(jax.vmap(parser))(tokens)
-    one_by_one = [parser(row) for row in tokens]
-    chex.assert_trees_all_equal(batched, jax.tree.map(lambda *rows: jnp.stack(rows), *one_by_one))
-
-
 def test_tokens_belong_to_the_segment_that_is_not_over():
     """A closing tag ends its own segment; one of `compare` before that of `perceive` ends none."""
     tokenizer = word_level(TOUCH_LANGUAGE)
@@ -224,8 +187,6 @@ def test_errors():
         compile_parser(dataclasses.replace(TOUCH_LANGUAGE, attributes=(HARDNESS, many)), tokenizer)
     with pytest.raises(ValueError, match="sensors is empty"):
         compile_parser(dataclasses.replace(TOUCH_LANGUAGE, sensors=()), tokenizer)
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        read(TOUCH_LANGUAGE, GOOD).formatted = False
 
 
 def test_thirty_one_levels_fit():

@@ -25,12 +25,6 @@ def problem():
     return features.astype(np.float32), labels, groups
 
 
-def test_log_probabilities_are_normalised(problem):
-    ours = cross_fit(*problem, K, CONFIG)
-    assert ours.shape == (60, K)
-    np.testing.assert_allclose(np.exp(ours).sum(-1), 1, rtol=1e-5)
-
-
 def test_an_identity_leaks_nothing():
     """Features that are the object's one-hot name: in sample a perfect probe, out of fold no information at all."""
     rng = np.random.default_rng(0)
@@ -74,11 +68,6 @@ def test_rows_that_are_only_read_change_no_other_and_are_read_by_a_probe_of_all_
     np.testing.assert_array_equal(found[kept], alone[:, 0, 0])
     whole = probe_log_probs(features, np.where(kept, labels, -1), kept[None], 3, CONFIG)[0]
     np.testing.assert_allclose(found[read_only], whole[read_only], atol=1e-4)
-
-
-def test_a_probe_beats_chance_out_of_fold(problem):
-    features, labels, groups = problem
-    assert (cross_fit(features, labels, groups, K, CONFIG).argmax(-1) == labels).mean() > 0.5
 
 
 def scipy_log_probs(features, labels, weight, penalty):

@@ -7,11 +7,7 @@ import optax
 import pytest
 
 from touchr1_jax.skipping import count_skipped, skip_nonfinite
-from touchr1_jax.training.optimizer import (
-    OptimizerConfig,
-    falling_adamw,
-    make_optimizer,
-)
+from touchr1_jax.training.optimizer import OptimizerConfig, falling_adamw, make_optimizer
 
 CONFIG = OptimizerConfig(learning_rate=1e-5, lr_scale=100.0, warmup_steps=4, max_grad_norm=1e9)
 

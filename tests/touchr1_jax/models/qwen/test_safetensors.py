@@ -59,13 +59,7 @@ def test_a_pointer_is_named(tmp_path):
         read_header(tmp_path / "x")
 
 
-def test_header_must_be_json(tmp_path):
-    raw_file(tmp_path / "x", b"not json", b"")
-    with pytest.raises(ValueError, match="the header is no JSON"):
-        read_header(tmp_path / "x")
-
-
-@pytest.mark.parametrize("header", [b"[]", b"7", b"[" * 100_000, b'{"a": 3}', b'{"a": "dtype"}'])
+@pytest.mark.parametrize("header", [b"not json", b"[]", b"7", b"[" * 100_000, b'{"a": 3}', b'{"a": "dtype"}'])
 def test_header_must_be_an_object_of_objects(tmp_path, header):
     raw_file(tmp_path / "x", header, b"")
     with pytest.raises(ValueError, match=r"header is no JSON|a lacks data_offsets"):

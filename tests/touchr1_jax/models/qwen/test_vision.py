@@ -12,14 +12,7 @@ from touchr1_jax.models.qwen.geometry import Grid
 from touchr1_jax.models.qwen.vision import QwenVision
 
 CONFIG = QwenVisionConfig(
-    out_size=6,
-    depth=2,
-    hidden_size=16,
-    num_heads=2,
-    intermediate_size=20,
-    patch_px=2,
-    window_px=8,
-    full_layers=(),
+    out_size=6, depth=2, hidden_size=16, num_heads=2, intermediate_size=20, patch_px=2, window_px=8, full_layers=()
 )
 GRID = Grid(1, 4, 8)  # 2 × 4 tokens, two windows of 2 × 2
 

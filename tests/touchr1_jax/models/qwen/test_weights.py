@@ -178,35 +178,37 @@ def test_no_weights_are_said_to_be_missing(tmp_path):
         load_params(tmp_path, CONFIG)
 
 
-def test_missing_shard_is_named(tmp_path, weights):
-    write_shards(tmp_path, weights)
-    (tmp_path / "model-00002-of-00003.safetensors").unlink()
-    with pytest.raises(FileNotFoundError, match=r"model-00002-of-00003\.safetensors is named by .* and is not there"):
-        load_params(tmp_path, CONFIG)
+SECOND, INDEX = "model-00002-of-00003.safetensors", "model.safetensors.index.json"
 
 
-def test_index_must_agree_with_its_shards(tmp_path, weights):
-    write_shards(tmp_path, weights)
-    index = json.loads((tmp_path / "model.safetensors.index.json").read_text())
+def forget_the_norm(folder, weights):
+    index = json.loads((folder / INDEX).read_text())
     del index["weight_map"]["model.norm.weight"]
-    (tmp_path / "model.safetensors.index.json").write_text(json.dumps(index))
-    with pytest.raises(ValueError, match=r"its shards differ in model\.norm\.weight"):
-        load_params(tmp_path, CONFIG)
+    (folder / INDEX).write_text(json.dumps(index))
 
 
-def test_shards_may_not_overlap(tmp_path, weights):
+def repeat_the_first(folder, weights):
+    names = sorted(weights)
+    write_file(folder / SECOND, {name: weights[name] for name in [*names[1::3], names[0]]})
+
+
+@pytest.mark.parametrize(
+    ("damage", "error", "message"),
+    [
+        (lambda folder, _: (folder / SECOND).unlink(), FileNotFoundError, f"{SECOND} is named by .* and is not there"),
+        (forget_the_norm, ValueError, r"its shards differ in model\.norm\.weight"),
+        (repeat_the_first, ValueError, f"{SECOND} holds lm_head.weight, as another shard"),
+        (
+            lambda folder, _: (folder / INDEX).unlink(),
+            FileNotFoundError,
+            "holds model-00001-of-00003.safetensors and not .*index.json",
+        ),
+    ],
+)
+def test_shards_that_do_not_fit_are_named(tmp_path, weights, damage, error, message):
     write_shards(tmp_path, weights)
-    names = sorted(weights)[1::3]
-    shard = {name: weights[name] for name in [*names, sorted(weights)[0]]}
-    write_file(tmp_path / "model-00002-of-00003.safetensors", shard)
-    with pytest.raises(ValueError, match=r"model-00002-of-00003\.safetensors holds lm_head\.weight, as another shard"):
-        load_params(tmp_path, CONFIG)
-
-
-def test_shards_without_an_index_ask_for_it(tmp_path, weights):
-    write_shards(tmp_path, weights)
-    (tmp_path / "model.safetensors.index.json").unlink()
-    with pytest.raises(FileNotFoundError, match=r"holds model-00001-of-00003\.safetensors and not .*index\.json"):
+    damage(tmp_path, weights)
+    with pytest.raises(error, match=message):
         load_params(tmp_path, CONFIG)
 
 
