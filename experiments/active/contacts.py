@@ -9,6 +9,7 @@ import functools
 import hashlib
 import itertools
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -128,13 +129,12 @@ def generate(config: ContactsConfig, context: Context) -> ContactBank:
 
     Files of some objects are units of work, which the run's launcher computes, by default in a process for each core.
     """
-    folder = f"touch_bank/{contacts_hash(config)}"
-    files, units = dict[str, functools.partial[dict[str, np.ndarray]]](), []
-    for start in range(0, config.objects, _OBJECTS_A_FILE):
-        name, rows = f"{folder}/{start:06d}", range(start, min(start + _OBJECTS_A_FILE, config.objects))
-        files[name] = functools.partial(contacts_of, config, rows)
+    folder, rows = f"touch_bank/{contacts_hash(config)}", range(config.objects)
+    parts = [rows[start : start + _OBJECTS_A_FILE] for start in rows[::_OBJECTS_A_FILE]]
+    files, units = {f"{folder}/{part[0]:06d}": functools.partial(contacts_of, config, part) for part in parts}, []
+    for name, make in files.items():
         path = (context.cache_dir / f"{name}.npz").absolute()
-        units.append(WorkUnit(name=name, run=functools.partial(_write, path, files[name]), done=path.exists))
+        units.append(WorkUnit(name=name, run=functools.partial(_write, path, make), done=path.exists))
     launcher = context.launcher
     if launcher.here:
         launcher = Launcher(workers=max(1, min(idle_cores(context), len(units) // _FILES_A_WORKER)))
@@ -157,7 +157,7 @@ def contacts_of(config: ContactsConfig, objects: range) -> dict[str, np.ndarray]
     return {"frames": np.stack(frames), "harm": np.stack(harm)}
 
 
-def _write(path: Path, make: functools.partial[dict[str, np.ndarray]]) -> None:
+def _write(path: Path, make: Callable[[], dict[str, np.ndarray]]) -> None:
     write_arrays(path, make())
 
 

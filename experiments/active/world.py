@@ -22,7 +22,7 @@ from experiments.active.encoder import (
     train_reader,
 )
 from experiments.active.headroom import Beliefs
-from experiments.core.concurrency import concurrently, in_threads
+from experiments.core.concurrency import in_threads
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
 from experiments.study.cache import fingerprint
@@ -72,9 +72,7 @@ def probe_beliefs(
 
 
 def crossed(
-    read: Callable[[Int[np.ndarray, "m"], int], Float[np.ndarray, "O C A K"]],
-    objects: Int[np.ndarray, "n"],
-    context: Context,
+    read: Callable[[Int[np.ndarray, "m"], int], Float[np.ndarray, "O C A K"]], objects: Int[np.ndarray, "n"]
 ) -> Float[np.ndarray, "O C A K"]:
     """Beliefs about all contacts by readers of which none learned from the object that it reads.
 
@@ -83,11 +81,9 @@ def crossed(
     Args:
       read: (objects to learn from, number of the reader) → its log-probabilities for all contacts.
       objects: dealt to folds; each is read by the reader of the other folds, all others by the mean of all readers.
-      context: of the run, which trains readers at the same time.
     """
     fold = group_folds(objects, PROBE)
-    of_fold = lambda k: read(objects[fold != k], k)
-    found = np.stack(concurrently(context, "folds", range(PROBE.folds), of_fold))
+    found = np.stack([read(objects[fold != k], k) for k in range(PROBE.folds)])
     mixed = np.array(jax.nn.log_softmax(found.mean(0)))
     mixed[objects] = found[fold, objects]
     return mixed
@@ -180,20 +176,19 @@ def _encoded(
     fitted = np.concatenate([parts["warm"], parts["reinforced"]])
     features, statistics = contact_features(made, context), contact_statistics(made, context)
     with context.timed("probes"):
-        probes = crossed(lambda learned, _: probe_beliefs(features, made.label, learned, context), fitted, context)
-    readers = dict[int, ContactReader]()
+        probes = crossed(lambda learned, _: probe_beliefs(features, made.label, learned, context), fitted)
+    readers: list[ContactReader] = []
 
     def read(learned: Int[np.ndarray, "m"], k: int) -> Float[np.ndarray, "O C A K"]:
-        readers[k] = train_reader(config.encoder, statistics, made.label, learned, context, k)
+        readers.append(train_reader(config.encoder, statistics, made.label, learned, context, k))
         choice = np.arange(statistics.shape[1], dtype=np.int32)
-        return np.stack([read_contacts(config.encoder, readers[k], of_object, choice) for of_object in statistics])
+        return np.stack([read_contacts(config.encoder, readers[-1], of_object, choice) for of_object in statistics])
 
     with context.timed("encoder"):
-        encoder = crossed(read, fitted, context)
+        encoder = crossed(read, fitted)
     both = np.asarray(jax.nn.log_softmax((encoder + probes) / 2))
     tokens = belief_tokens(both, belief_scale(both))
-    in_order = [readers[k] for k in sorted(readers)]
-    return {"tokens": tokens, "read": both, "encoder": encoder, "probes": probes} | stored(in_order)
+    return {"tokens": tokens, "read": both, "encoder": encoder, "probes": probes} | stored(readers)
 
 
 def stored(readers: Sequence[ContactReader]) -> dict[str, np.ndarray]:

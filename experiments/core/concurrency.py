@@ -17,8 +17,7 @@ ONE_SEED_BYTES, SEED_BYTES = 4 * GIB, round(1.4 * GIB)
 """Memory of the first seed of a default study with its clips, and of each further one: arrays, and a compilation that
 may run at the same time as another.  Measured: 2.8 and 4.3 GiB with one seed and two."""
 
-THREADS = 2
-"""Of `in_threads`."""
+THREADS = 2  # of `in_threads`
 
 Item = TypeVar("Item")
 T = TypeVar("T")

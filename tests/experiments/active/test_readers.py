@@ -8,7 +8,7 @@ from experiments.active.world import PROBE, crossed
 OBJECTS, CHOICES, LEVELS = 9, 2, 3
 
 
-def test_no_object_is_read_by_a_reader_that_learned_from_it(context):
+def test_no_object_is_read_by_a_reader_that_learned_from_it():
     learned_from = []
 
     def read(learned, number):
@@ -18,7 +18,7 @@ def test_no_object_is_read_by_a_reader_that_learned_from_it(context):
         return scores
 
     objects = np.array([0, 2, 3, 5, 6, 8])
-    found = crossed(read, objects, context)
+    found = crossed(read, objects)
     assert len(learned_from) == PROBE.folds
     assert all(set(objects.tolist()) > part for part in learned_from)
     assert set.intersection(*learned_from) == set()
