@@ -17,7 +17,7 @@ from jaxtyping import Int
 
 from experiments.active.arms import Arm, as_json
 from experiments.active.contacts import PROPERTIES
-from experiments.active.plans import NO_CHOICE, Played
+from experiments.active.plans import Played
 from experiments.active.world import TouchWorld
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
@@ -25,7 +25,7 @@ from experiments.core.results import Table, named_table
 from touchr1_jax.models.active_policy import ActivePolicy
 from touchr1_jax.rl.environment import TouchBank
 from touchr1_jax.rl.gymnasium_env import Episodes
-from touchr1_jax.training.exploration import touch_batch_of
+from touchr1_jax.training.exploration import NO_CHOICE, touch_batch_of
 
 AGENT = "ppo"
 PACKAGES = ("gymnasium", "stable_baselines3")

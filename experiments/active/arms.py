@@ -10,7 +10,6 @@ from jaxtyping import Float
 
 from experiments.active.headroom import Beliefs
 from experiments.active.plans import (
-    NO_CHOICE,
     Answer,
     LookUps,
     Played,
@@ -30,7 +29,7 @@ from touchr1_jax.models.active_policy import ActivePolicy, build_active_policy
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.rl.config import GRPOConfig, Norm, Paper
 from touchr1_jax.rl.touch_reward import Prices
-from touchr1_jax.training.exploration import check_exploration, touch_batch_of
+from touchr1_jax.training.exploration import NO_CHOICE, check_exploration, touch_batch_of
 from touchr1_jax.training.optimizer import OptimizerConfig
 from touchr1_jax.training.train_sft import SFTConfig
 from touchr1_jax.types import Params

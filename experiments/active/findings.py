@@ -10,7 +10,7 @@ from experiments.active.agents import AGENT
 from experiments.active.arms import EVERY_TOUCH, Arm, LearnerConfig, counted
 from experiments.active.contacts import PROPERTIES
 from experiments.active.headroom import BY_BELIEF, BY_QUESTION, Beliefs, headroom
-from experiments.active.plans import NO_CHOICE, Played
+from experiments.active.plans import Played
 from experiments.active.world import TouchWorld
 from experiments.core.results import (
     Comparison,
@@ -26,6 +26,7 @@ from experiments.core.text import bounds, number
 from experiments.study.estimates import compare_over_objects, compare_over_seeds, estimate
 from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.bench.statistics import Interval
+from touchr1_jax.training.exploration import NO_CHOICE
 
 METRIC = "acc"  # mean of the accuracy over the five properties
 

@@ -8,8 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from experiments.active.headroom import Beliefs, best_choices, best_sequence
 from touchr1_jax.rl.environment import TouchBank
-
-NO_CHOICE = -1
+from touchr1_jax.training.exploration import NO_CHOICE
 
 Answer = Callable[[Int[np.ndarray, "n"], Int[np.ndarray, "n"], Int[np.ndarray, "n k"]], Float[np.ndarray, "n K"]]
 """(objects, questions, choices in order) → log-probabilities of the levels, by one policy; `NO_CHOICE` ends a row."""

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from experiments.active.encoder import DrawnFeed
-from experiments.active.plans import NO_CHOICE, Answer, Played
+from experiments.active.plans import Answer, Played
 from experiments.core.context import Context
 from experiments.core.loops import stage_hooks
 from experiments.study.alarm_log import alarm_log
@@ -20,44 +20,21 @@ from touchr1_jax.rl.active_alarms import ACTIVE_RULES
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.environment import TouchBank
 from touchr1_jax.rl.touch_reward import Prices
-from touchr1_jax.training.exploration import ActiveFeed, RandomTouchFeed, touch_batch_of, train_active
+from touchr1_jax.training.exploration import (
+    NO_CHOICE,
+    ActiveFeed,
+    RandomTouchFeed,
+    WrittenTurns,
+    demonstration,
+    touch_batch_of,
+    train_active,
+)
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.sft import SFTBatch
 from touchr1_jax.training.train_sft import SFTConfig, train_sft
 from touchr1_jax.types import Params
 
 ROWS = 256  # trajectories that are scored at once
-
-
-@dataclasses.dataclass(frozen=True)
-class Script:
-    """Tokens of every turn of a policy: [C, L] of actions, [A, K, L] of answers, padded."""
-
-    actions: Int[np.ndarray, "C L"]
-    answers: Int[np.ndarray, "A K L"]
-    pad: int
-
-    @staticmethod
-    def of(policy: ActivePolicy) -> "Script":
-        """Those of a policy's language."""
-        language, tokenizer, length = policy.language, policy.tokenizer, policy.turns.length
-        row = lambda text: np.array(
-            (ids := tokenizer.encode(text)) + [tokenizer.pad_id] * (length - len(ids)), np.int32
-        )
-        levels = [[row(language.answer_text(words[0])) for words in a.levels] for a in language.attributes]
-        actions = [row(language.action_text(c)) for c in range(len(language.actions))]
-        return Script(np.stack(actions), np.array(levels), tokenizer.pad_id)
-
-    def trajectories(
-        self, choices: Int[np.ndarray, "n B"], question: Int[np.ndarray, "n"], level: Int[np.ndarray, "n"]
-    ) -> Int[np.ndarray, "n T"]:
-        """Tokens of trajectories with these choices, `NO_CHOICE` from where they stop, and the answer after them."""
-        n, budget = choices.shape
-        made = choices != NO_CHOICE
-        turns = np.full((n, budget + 1, self.actions.shape[1]), self.pad, np.int32)
-        turns[:, :budget] = np.where(made[..., None], self.actions[np.maximum(choices, 0)], self.pad)
-        turns[np.arange(n), made.sum(1)] = self.answers[question, level]
-        return turns.reshape(n, -1)
 
 
 def observed(
@@ -102,23 +79,11 @@ def imitate(
     seed: int,
 ) -> Params:
     """SFT on trajectories of one given touch for each object of a bank and question, and the right answer."""
-    script, label = Script.of(policy), np.asarray(bank.label)
+    written, of_host = WrittenTurns.of(policy), jax.device_get(bank)
 
     def make(rng: np.random.Generator) -> SFTBatch:
-        n = config.batch_size
-        which, question = rng.integers(len(label), size=n), rng.integers(label.shape[1], size=n)
-        chosen = choice[which, question][:, None]
-        tokens = script.trajectories(chosen, question, label[which, question])
-        touch, exists = observed(bank, which, chosen)
-        of: dict[str, Any] = {
-            "touch": Explored(policy.prompt_features(n), touch[:, None], exists[:, None], jnp.ones((n, 1), bool)),
-            "ids": policy.ids[question][:, None],
-            "mask": policy.mask[question][:, None],
-            "streams": np.ones((n, 1, 1), bool),
-            "tokens": tokens[:, None],
-            "token_mask": (tokens != script.pad)[:, None],
-        }
-        return SFTBatch(**of)
+        which, question = (rng.integers(n, size=config.batch_size) for n in of_host.label.shape)
+        return demonstration(policy, written, of_host, which, question, choice[which, question][:, None])
 
     with stage_hooks(context, stage, config.steps) as hooks:
         return train_sft(policy, params, DrawnFeed(make, seed), config, hooks, seed=seed)
@@ -185,16 +150,16 @@ def _explorer(policy: ActivePolicy, budget: int) -> Any:
 
 def answerer(policy: ActivePolicy, params: Params, bank: TouchBank) -> Answer:
     """The levels that a policy believes in after given contacts, as if it had chosen to stop there."""
-    script = Script.of(policy)
+    written = WrittenTurns.of(policy)
 
     def answer(objects: np.ndarray, questions: np.ndarray, choices: np.ndarray) -> np.ndarray:
-        found = np.empty((len(objects), script.answers.shape[1]), np.float32)
+        found = np.empty((len(objects), written.answers.shape[1]), np.float32)
         for question in np.unique(questions):
             of_question = np.flatnonzero(questions == question)
             for start in range(0, len(of_question), ROWS):
                 rows = of_question[start : start + ROWS]
                 at = rows[np.minimum(np.arange(ROWS), len(rows) - 1)]
-                found[rows] = _levels(policy, params, bank, script, objects[at], int(question), choices[at])[
+                found[rows] = _levels(policy, params, bank, written, objects[at], int(question), choices[at])[
                     : len(rows)
                 ]
         return found
@@ -215,19 +180,19 @@ def _levels(
     policy: ActivePolicy,
     params: Params,
     bank: TouchBank,
-    script: Script,
+    written: WrittenTurns,
     objects: np.ndarray,
     question: int,
     choices: np.ndarray,
 ) -> Float[np.ndarray, "n K"]:
     """Log-probabilities of the levels of one question."""
     zeros = np.zeros(len(objects), np.int32)
-    tokens = script.trajectories(choices, zeros + question, zeros)
-    word = np.argmax(script.answers[question, 0] != script.answers[question, 1])  # where answers differ
-    at = (choices != NO_CHOICE).sum(1) * script.actions.shape[1] + word
+    tokens = written.trajectories(choices, zeros + question, zeros)
+    word = np.argmax(written.answers[question, 0] != written.answers[question, 1])  # where answers differ
+    at = (choices != NO_CHOICE).sum(1) * written.actions.shape[1] + word
     touch, exists = observed(bank, objects, choices)
     seen = Explored(jax.tree.map(lambda x: x[0], policy.prompt_features(1)), touch, exists, jnp.ones(1, bool))
-    ids = script.answers[question, :, word]
+    ids = written.answers[question, :, word]
     return np.asarray(
         _level_log_probs(policy.fns, params, seen, policy.ids[question], policy.mask[question], tokens, at, ids)
     )

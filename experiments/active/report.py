@@ -7,12 +7,13 @@ from jaxtyping import Float, Int
 
 from experiments.active.contacts import PROPERTIES, ContactsConfig
 from experiments.active.headroom import EVERY, PLANS, Beliefs, single
-from experiments.active.plans import NO_CHOICE, Played
+from experiments.active.plans import Played
 from experiments.core.charts import Panel, Series, draw
 from experiments.core.pictures import Heatmap, heatmaps, image_grid
 from experiments.core.results import Cell, Picture, Table, named_table
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
 from touchr1_jax.text.language import EXPLORED_ATTRIBUTES
+from touchr1_jax.training.exploration import NO_CHOICE
 
 PROCEDURES: Mapping[str, str] = {
     "hardness": "pressure",

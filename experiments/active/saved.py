@@ -29,7 +29,6 @@ from experiments.active.encoder import (
     patch_statistics,
     read_contacts,
 )
-from experiments.active.plans import NO_CHOICE
 from experiments.active.policies import answerer, explore
 from experiments.active.world import TouchWorld, restored, stored
 from experiments.core.artifacts import DamagedFileError, jsonable, read_json, write_sealed
@@ -43,6 +42,7 @@ from touchr1_jax.models.saved_policy import PolicyError
 from touchr1_jax.models.stacked import restacked, unstacked
 from touchr1_jax.rl.environment import TouchBank, TouchChoice
 from touchr1_jax.text.language import EXPLORED_ATTRIBUTES
+from touchr1_jax.training.exploration import NO_CHOICE
 from touchr1_jax.types import Params
 
 FORMAT, VERSION = "touchr1-explorer", 1

@@ -21,7 +21,7 @@ import numpy as np
 from experiments.active import active_touch
 from experiments.active.arms import Arm, LearnerConfig, as_json, from_json, make_policy, reinforced_params, warm_params
 from experiments.active.contacts import PROPERTIES
-from experiments.active.plans import NO_CHOICE, Played
+from experiments.active.plans import Played
 from experiments.active.policies import explore
 from experiments.active.report import found_questions
 from experiments.active.world import TouchWorld, WorldConfig, make_world
@@ -32,6 +32,7 @@ from experiments.core.results import Requirement, Results, Table, at_least, name
 from experiments.core.runner import Experiment
 from experiments.study.alarm_log import ALARM
 from touchr1_jax.models.active_policy import ActivePolicy
+from touchr1_jax.training.exploration import NO_CHOICE
 
 ENOUGH = 4  # questions of five whose motion a seed must find
 SHARE = 80.0  # per cent of the seeds that must find so many

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 
 from experiments.active.arms import TOUCHES, as_json, from_json
 from experiments.active.encoder import belief_scale, belief_tokens
-from experiments.active.plans import NO_CHOICE, Answer, Played, play, same_for_all, until_sure
+from experiments.active.plans import Answer, Played, play, same_for_all, until_sure
 from experiments.active.policies import answerer, explore, part_of, reinforce, warm_up
 from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context
@@ -33,6 +33,7 @@ from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.environment import TouchBank, TouchChoice
 from touchr1_jax.rl.touch_reward import Prices
+from touchr1_jax.training.exploration import NO_CHOICE
 from touchr1_jax.training.kernel_probe import KernelProbeConfig, cross_probe, object_weights
 from touchr1_jax.training.optimizer import OptimizerConfig
 from touchr1_jax.training.train_sft import SFTConfig

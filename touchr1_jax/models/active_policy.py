@@ -172,13 +172,7 @@ class ActivePolicy:
 
     def init(self, seed: int, width: int) -> Params:
         """Fresh parameters of the decoder and of the projection of observations of `width` numbers a token."""
-        fns, features = self.fns, jax.tree.map(lambda x: jnp.asarray(x[0]), self.prompt_features(1))
-
-        def touch_all(module: Policy, ids: Array, mask: Array) -> Array:
-            state, _ = module.prefill_state(features, ids, mask, fns.slots)
-            return module.logits(state + module.project(jnp.zeros((1, width)))[0], jnp.asarray(fns.banned))
-
-        init = jax.jit(lambda key, ids, mask: fns.module.init(key, ids, mask, method=touch_all))
+        init = _initializer(self, width)
         return init(jax.random.key(seed), jnp.asarray(self.ids[0]), jnp.asarray(self.mask[0]))["params"]
 
     def prompt_features(self, n: int) -> Features:
@@ -205,6 +199,19 @@ class ActivePolicy:
             "streams": np.ones((len(label), 1), bool),
         }
         return Target(**of)
+
+
+@functools.cache
+def _initializer(policy: ActivePolicy, width: int) -> Any:
+    """Compiled (key, ids, mask) → fresh variables, made once for all seeds."""
+    fns = policy.fns
+
+    def touch_all(module: Policy, ids: Array, mask: Array) -> Array:
+        features = jax.tree.map(lambda x: jnp.asarray(x[0]), policy.prompt_features(1))
+        state, _ = module.prefill_state(features, ids, mask, fns.slots)
+        return module.logits(state + module.project(jnp.zeros((1, width)))[0], jnp.asarray(fns.banned))
+
+    return jax.jit(lambda key, ids, mask: fns.module.init(key, ids, mask, method=touch_all))
 
 
 def build_active_policy(

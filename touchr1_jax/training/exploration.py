@@ -6,6 +6,7 @@ params = train_sft(policy, params, RandomTouchFeed(policy, bank, batch_size=16, 
 params = train_active(policy, params, ActiveFeed(policy, bank, ...), bank, config, LoopConfig(steps=200), ...)
 """
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -13,6 +14,7 @@ import grain
 import jax
 import numpy as np
 import optax
+from jaxtyping import Bool, Int
 
 from touchr1_jax.models.active_policy import ActiveFns, ActivePolicy, Explored
 from touchr1_jax.rl.active import ActiveInputs, make_active_step
@@ -27,6 +29,40 @@ from touchr1_jax.training.optimizer import falling_adamw
 from touchr1_jax.training.questions import labelled_questions
 from touchr1_jax.training.sft import SFTBatch
 from touchr1_jax.types import Params
+
+NO_CHOICE = -1
+"""Stands in a row of choices where the trajectory has concluded."""
+
+
+@dataclasses.dataclass(frozen=True)
+class WrittenTurns:
+    """Tokens of every turn of a policy: [C, L] of actions, [A, K, L] of answers, padded."""
+
+    actions: Int[np.ndarray, "C L"]
+    answers: Int[np.ndarray, "A K L"]
+    pad: int
+
+    @staticmethod
+    def of(policy: ActivePolicy) -> "WrittenTurns":
+        """Those of a policy's language."""
+        language, tokenizer, length = policy.language, policy.tokenizer, policy.turns.length
+        row = lambda text: np.array(
+            (ids := tokenizer.encode(text)) + [tokenizer.pad_id] * (length - len(ids)), np.int32
+        )
+        levels = [[row(language.answer_text(words[0])) for words in a.levels] for a in language.attributes]
+        actions = [row(language.action_text(c)) for c in range(len(language.actions))]
+        return WrittenTurns(np.stack(actions), np.array(levels), tokenizer.pad_id)
+
+    def trajectories(
+        self, choices: Int[np.ndarray, "n B"], question: Int[np.ndarray, "n"], level: Int[np.ndarray, "n"]
+    ) -> Int[np.ndarray, "n T"]:
+        """Tokens of trajectories with these choices, `NO_CHOICE` from where they stop, and the answer after them."""
+        n, budget = choices.shape
+        made = choices != NO_CHOICE
+        turns = np.full((n, budget + 1, self.actions.shape[1]), self.pad, np.int32)
+        turns[:, :budget] = np.where(made[..., None], self.actions[np.maximum(choices, 0)], self.pad)
+        turns[np.arange(n), made.sum(1)] = self.answers[question, level]
+        return turns.reshape(n, -1)
 
 
 def exploration_batch(policy: ActivePolicy, attribute: np.ndarray, label: np.ndarray, case: Any) -> ActiveBatch:
@@ -63,6 +99,47 @@ def touch_batch_of(
     return exploration_batch(policy, attribute, np.asarray(bank.label)[which], TouchCase(*case))
 
 
+def demonstration(
+    policy: ActivePolicy,
+    written: WrittenTurns,
+    bank: TouchBank,
+    which: Int[np.ndarray, "P"],
+    attribute: Int[np.ndarray, "P"],
+    choices: Int[np.ndarray, "P B"],
+    offered: Bool[np.ndarray, "P C"] | None = None,
+) -> SFTBatch:
+    """SFT batch on the host: row i makes its choices about object which[i] and gives the right answer to attribute[i].
+
+    Args:
+      policy, written: prompts, and the turns of its language.
+      bank: contacts, on the host.
+      which, attribute: object and question.
+      choices: in order, `NO_CHOICE` from where a trajectory concludes.
+      offered: choices that have not dropped out; by default all.  Of the others nothing is observed.
+    """
+    n, rows, at = len(which), np.arange(len(which))[:, None], np.maximum(choices, 0)
+    observed = (choices != NO_CHOICE) & bank.available[which[:, None], at]
+    if offered is not None:
+        observed &= offered[rows, at]
+    touch = np.where(observed[..., None, None], bank.tokens[which[:, None], at], 0).astype(np.float32)
+    tokens = written.trajectories(choices, attribute, np.asarray(bank.label)[which, attribute])
+    seen: dict[str, Any] = {
+        "prompt": policy.prompt_features(n),
+        "touch": touch[:, None],
+        "exists": np.broadcast_to(observed[:, None, :, None], (n, 1, *touch.shape[1:3])),
+        "stream_mask": observed.any(1, keepdims=True),
+    }
+    of: dict[str, Any] = {
+        "touch": Explored(**seen),
+        "ids": policy.ids[attribute][:, None],
+        "mask": policy.mask[attribute][:, None],
+        "streams": np.ones((n, 1, 1), bool),
+        "tokens": tokens[:, None],
+        "token_mask": (tokens != written.pad)[:, None],
+    }
+    return SFTBatch(**of)
+
+
 def drop_out(bank: TouchBank, n: int, share: float, rng: np.random.Generator) -> np.ndarray:
     """Choices that stay when each sensor and each motion drops out with probability `share`, bool [n, C].
 
@@ -76,7 +153,7 @@ def drop_out(bank: TouchBank, n: int, share: float, rng: np.random.Generator) ->
 
 
 class _BankFeed(Feed):
-    """Questions about the objects of a bank in random order."""
+    """Questions about the objects of a bank, each once an epoch, in random order."""
 
     def __init__(
         self, policy: ActivePolicy, bank: TouchBank, *, batch_size: int, seed: int, dropout: float = 0.0
@@ -86,8 +163,16 @@ class _BankFeed(Feed):
         check_bank(bank)
         self._policy, self._bank, self._dropout = policy, jax.device_get(bank), dropout
         self._object, self._attribute = labelled_questions(np.asarray(bank.label))
-        order = grain.MapDataset.range(len(self._object)).seed(seed).shuffle().repeat().batch(batch_size)
-        super().__init__(order.to_iter_dataset(ONE_AT_A_TIME), seed)
+        n = len(self._object)
+        order = functools.lru_cache(2)(lambda epoch: np.random.default_rng((seed, epoch)).permutation(n))
+
+        def rows(batch: int, _: Any) -> Int[np.ndarray, "P"]:
+            epoch, place = np.divmod(batch * batch_size + np.arange(batch_size), n)
+            return np.array([order(e)[i] for e, i in zip(epoch.tolist(), place, strict=True)])
+
+        # Grain's own shuffle takes .1 ms a row: a tenth of a warm start
+        batches = grain.MapDataset.range(1).repeat().map_with_index(rows)
+        super().__init__(batches.to_iter_dataset(ONE_AT_A_TIME), seed)
 
 
 class ActiveFeed(_BankFeed):
@@ -119,46 +204,16 @@ class RandomTouchFeed(_BankFeed):
         super().__init__(policy, bank, **options)
         if not 1 <= budget <= len(bank.choices):
             raise ValueError(f"budget is {budget}: must lie in 1 … {len(bank.choices)}, the choices; change it")
-        self._budget = budget
-        language, encode = policy.language, policy.tokenizer.encode
-        self._actions = [encode(language.action_text(i)) for i in range(len(language.actions))]
-        self._answers = [[encode(language.answer_text(words[0])) for words in a.levels] for a in language.attributes]
+        self._budget, self._written = budget, WrittenTurns.of(policy)
 
     def make(self, element: np.ndarray, rng: np.random.Generator) -> SFTBatch:
         """One batch of trajectories."""
         which, attribute, n = self._object[element], self._attribute[element], len(element)
-        batch = touch_batch_of(self._policy, self._bank, which, attribute)
         offered = drop_out(self._bank, n, self._dropout, rng)
         chosen = np.argsort(rng.random(offered.shape), 1)[:, : self._budget]
         taken = np.arange(self._budget) < rng.integers(0, self._budget + 1, (n, 1))
-        rows = np.arange(n)[:, None]
-        felt = taken & offered[rows, chosen] & self._bank.available[which[:, None], chosen]
-        touch = np.where(felt[..., None, None], self._bank.tokens[which[:, None], chosen], 0).astype(np.float32)
-        tokens = np.stack([self._written(*row) for row in zip(chosen, taken.sum(1), attribute, which, strict=True)])
-        seen: dict[str, Any] = {
-            "prompt": batch.features,
-            "touch": touch[:, None],
-            "exists": np.broadcast_to(felt[:, None, :, None], (n, 1, *touch.shape[1:3])),
-            "stream_mask": felt.any(1, keepdims=True),
-        }
-        of: dict[str, Any] = {
-            "touch": Explored(**seen),
-            "ids": batch.ids[:, None],
-            "mask": batch.mask[:, None],
-            "streams": np.ones((n, 1, 1), bool),
-            "tokens": tokens[:, None],
-            "token_mask": (tokens != self._policy.tokenizer.pad_id)[:, None],
-        }
-        return SFTBatch(**of)
-
-    def _written(self, chosen: np.ndarray, count: int, attribute: int, which: int) -> np.ndarray:
-        """Tokens [T] of some actions and the right answer."""
-        level = int(self._bank.label[which, attribute])
-        turns = [*(self._actions[c] for c in chosen[:count]), self._answers[attribute][level]]
-        tokens = np.full((self._budget + 1, self._policy.turns.length), self._policy.tokenizer.pad_id, np.int32)
-        for row, ids in zip(tokens, turns, strict=False):
-            row[: len(ids)] = ids
-        return tokens.reshape(-1)
+        choices = np.where(taken, chosen, NO_CHOICE)
+        return demonstration(self._policy, self._written, self._bank, which, attribute, choices, offered)
 
 
 def train_active(

@@ -11,7 +11,6 @@ from experiments.active.contacts import ContactsConfig
 from experiments.active.findings import scores_of
 from experiments.active.headroom import Beliefs
 from experiments.active.plans import (
-    NO_CHOICE,
     Played,
     at_random,
     look_up,
@@ -22,6 +21,7 @@ from experiments.active.plans import (
 )
 from experiments.active.report import found_motion, motion_accuracy
 from touchr1_jax.rl.environment import TouchBank, TouchChoice
+from touchr1_jax.training.exploration import NO_CHOICE
 
 CHOICES = [TouchChoice(sensor="tac3d", motion=m, force_n=2.0) for m in ("press", "slide_x", "hold")]
 LABEL = np.array([[0, 2], [1, 1], [2, 0], [0, 1]])

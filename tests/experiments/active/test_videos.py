@@ -7,11 +7,12 @@ import pytest
 from rich.console import Console
 
 from experiments.active import videos
-from experiments.active.plans import NO_CHOICE, Played
+from experiments.active.plans import Played
 from experiments.active.videos import StoppingConfig, bank_of, controls_of, equal_videos, video_table, world_of
 from experiments.core.context import Context
 from experiments.recordings.descriptions import DescribedVideos
 from sensors_io.touches import families
+from touchr1_jax.training.exploration import NO_CHOICE
 
 OBJECTS, VIDEOS, A = 12, 4, 3
 CONFIG = StoppingConfig(videos=3, folds=3)
