@@ -8,7 +8,7 @@ READY  := $(VENV)/.ready
 
 PYTHONS ?= python3.11 python3.12
 
-.PHONY: help setup experiment demo test test-slow test-matrix lint format docs dist clean
+.PHONY: help setup experiment demo test test-long test-slow test-matrix lint format docs dist clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -28,8 +28,13 @@ experiment: setup  ## run an experiment: EXP=name, ARGS="--scale smoke ..."
 demo: setup  ## ask a trained policy in the browser: ARGS="POLICY", that of the package by default
 	$(BIN)/python -m experiments demo $(ARGS)
 
-test: setup  ## pass the tests (under ten minutes on two cores)
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
+PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
+
+test: setup  ## pass the tests (five minutes on two cores)
+	$(PYTEST) -m 'not long and not slow' $(ARGS)
+
+test-long: setup  ## pass the tests that train or compile for seconds (ten minutes)
+	$(PYTEST) -m 'long and not slow' $(ARGS)
 
 test-slow: setup  ## pass the tests that take minutes
 	$(BIN)/python -m pytest -q -m slow $(ARGS)

@@ -10,6 +10,7 @@ ROOT = Path(__file__).resolve().parent.parent
 CODE = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
+@pytest.mark.long
 def test_another_encoder_is_built_as_the_page_says(capsys):
     blocks = CODE.findall((ROOT / "docs" / "ENCODER.md").read_text(encoding="utf-8"))
     known: dict[str, object] = {}
@@ -18,6 +19,7 @@ def test_another_encoder_is_built_as_the_page_says(capsys):
     assert capsys.readouterr().out == "(4, 2, 4, 96)\n"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")), ids=lambda path: path.stem)
 def test_a_notebook_runs_and_keeps_no_outputs(path, capsys):
     cells = [c for c in json.loads(path.read_text(encoding="utf-8"))["cells"] if c["cell_type"] == "code"]

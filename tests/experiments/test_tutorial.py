@@ -86,6 +86,7 @@ def follow(checkout: Path, run: Callable[..., str]) -> list[str]:
     return done
 
 
+@pytest.mark.long
 def test_every_step_does_what_it_says(checkout, run):
     assert RUN in TUTORIAL.read_text(encoding="utf-8")
     assert follow(checkout, run) == ["experiments", "pytest", "touchr1_jax.rewards", "experiments", "pytest"]

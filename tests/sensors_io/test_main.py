@@ -198,6 +198,7 @@ def test_help_names_every_command_and_a_wrong_one_is_told_the_right_ones(run):
     assert "  label       Give recorded objects labels" in err
 
 
+@pytest.mark.long
 def test_only_generating_scenes_waits_for_jax():
     """Importing it takes longer than most commands work; `list` begins without SciPy, too."""
     others = {place.partition(".")[0] for place in cli.COMMANDS.values()} - {"generate"}

@@ -23,6 +23,7 @@ def world(**changes):
     return SimpleNamespace(bank=dataclasses.replace(WHOLE, **changes), parts={"reinforced": np.arange(4)})
 
 
+@pytest.mark.long
 def test_arms_that_can_learn_pass():
     check_arms(world(), POLICY, {"chosen": Arm(budget=1), "chosen_2": Arm(budget=2, second=0.01, harm=0.1)})
 

@@ -91,6 +91,7 @@ def test_a_tree_stops_where_a_contact_costs_more_than_it_is_worth():
     np.testing.assert_allclose(worth_of_tree(dear, 0, tree), dear.worth(0, (tree.choice,)))
 
 
+@pytest.mark.long
 def test_the_best_tree_is_the_best_of_all_trees():
     some = Beliefs(
         np.random.default_rng(5).normal(size=(20, 3, 1, 3)), np.random.default_rng(6).integers(3, size=(20, 1))

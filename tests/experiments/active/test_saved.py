@@ -17,6 +17,7 @@ def asking():
     return touching()
 
 
+@pytest.mark.long
 def test_it_asks_for_each_contact_once_and_concludes(asking):
     one, question = asking
     requested = []
@@ -40,6 +41,7 @@ def test_what_is_observed_changes_the_answer_and_nothing_observed_does_not(askin
     np.testing.assert_array_equal(unseen[0].probabilities, unseen[1].probabilities)
 
 
+@pytest.mark.long
 def test_a_folder_gives_back_the_policy(asking, tmp_path):
     one, question = asking
     save_explorer(tmp_path / "policy", one)

@@ -54,6 +54,7 @@ def ask(runs, *words):
     return run_asking(["ask", *map(str, words), "--runs-dir", str(runs), "--cache-dir", str(runs / "cache")])
 
 
+@pytest.mark.long
 def test_the_answers_are_those_of_a_study(asked, policy, params, data, records, context):
     rows = data.parts["test"][:2]
     features = encode_rows(policy, params, data, rows, context)
@@ -170,6 +171,7 @@ def test_what_is_no_input_is_named(asked, records, tmp_path, source, message):
         read_touch(source, asked.saved)
 
 
+@pytest.mark.long
 def test_the_command_prints_json_and_writes_a_page(runs, records, tmp_path, capsys):
     page = tmp_path / "page.html"
     words = [runs / "trial" / "latest" / "sft", f"{records}:0", f"{records}:1", "--question", "Which is softer?"]
@@ -218,6 +220,7 @@ def test_notes_and_levels_of_another_version_are_named_or_left_out(asked):
     assert read_touch("generated:3", odd).truth.keys() == {"roughness", "protrusion", "material"}
 
 
+@pytest.mark.long
 def test_a_name_that_is_not_utf_8_gets_a_page(runs, tmp_path, capsys):
     print_in_any_encoding()
     folder = tmp_path / "p\udcff"
@@ -239,6 +242,7 @@ def test_a_damaged_result_is_named_where_its_card_is_written(runs, tmp_path, cap
     results.write_text(before)
 
 
+@pytest.mark.long
 def test_an_exported_folder_and_a_repository_of_the_hub_are_policies(runs, asked, tmp_path, monkeypatch, capsys):
     folder, uploaded = tmp_path / "exported", []
     assert run_asking(["export", "trial/latest/sft/0", str(folder), "--runs-dir", str(runs)]) == 0
@@ -260,6 +264,7 @@ def test_an_exported_folder_and_a_repository_of_the_hub_are_policies(runs, asked
         load_policy("nowhere")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("command", [("ask", "hub:me/touch", "generated"), ("export", "touch-small", "hub:me/touch")])
 def test_a_hub_that_fails_or_is_not_there_is_one_line(command, monkeypatch, capsys):
     def fails(*args, **options):
@@ -274,6 +279,7 @@ def test_a_hub_that_fails_or_is_not_there_is_one_line(command, monkeypatch, caps
         assert len(error.splitlines()) == 1
 
 
+@pytest.mark.long
 def test_an_exported_policy_may_lie_at_a_url(runs, asked, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv(CACHE, str(tmp_path / "cache"))
     url = "memory://bucket/policy"
@@ -340,6 +346,7 @@ def test_the_demo_is_closed_to_other_pages_and_files(address, records):
     assert fetch(address, "video?name=a.avi", b"", **{"Content-Length": str(2**40)})[0] == 413
 
 
+@pytest.mark.long
 def test_the_readme_asks_the_policy_of_the_package(capsys):
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     [snippet] = [block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "load_policy" in block]

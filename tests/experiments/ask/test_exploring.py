@@ -29,6 +29,7 @@ def ask(saved, home, *arguments):
     return run_asking(["ask", folder, *arguments, "--question", question, "--cache-dir", str(home)])
 
 
+@pytest.mark.long
 def test_a_person_answers_with_pictures(saved, tmp_path, monkeypatch, capsys):
     pictures = tmp_path / "press"
     pictures.mkdir()
@@ -44,12 +45,14 @@ def test_a_person_answers_with_pictures(saved, tmp_path, monkeypatch, capsys):
     assert "after " in said.splitlines()[-1]
 
 
+@pytest.mark.long
 def test_contacts_that_cannot_be_made_are_not_observed(saved, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sys.stdin", io.StringIO("\n" * 9))
     assert ask(saved, tmp_path) == 0
     assert re.search(r"%.*after (\d) touch.*; \1 of them could not be made", capsys.readouterr().out.splitlines()[-1])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("said", [b"", b"\xff\xfe\n"])
 def test_answers_that_end_are_no_answer(saved, tmp_path, monkeypatch, capsys, said):
     monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(said), encoding="utf-8"))

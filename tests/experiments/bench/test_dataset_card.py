@@ -24,6 +24,7 @@ def directory(tmp_path_factory, records):
     return run_shrunk(dataset_card, config, tmp_path_factory.mktemp("runs"))
 
 
+@pytest.mark.long
 def test_everything_is_reported(directory):
     results = read_json(directory / "results.json")
     assert all(r["met"] for r in results["requirements"])

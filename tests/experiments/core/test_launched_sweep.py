@@ -3,6 +3,8 @@
 import json
 from pathlib import Path
 
+import pytest
+
 from experiments.core.artifacts import read_json
 from experiments.core.sweep import main as sweep
 
@@ -21,6 +23,7 @@ def results(folder: str) -> dict[str, str]:
     return found
 
 
+@pytest.mark.long
 def test_workers_make_the_same_results(tmp_path, monkeypatch, capfd):
     """One unit is there already, so that a single worker is started, which takes seconds."""
     monkeypatch.chdir(tmp_path)

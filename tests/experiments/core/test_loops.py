@@ -26,6 +26,7 @@ def whole(tmp_path_factory):
     return folder
 
 
+@pytest.mark.long
 def test_a_signal_ends_the_run_after_the_step_is_saved(whole, tmp_path, capsys, monkeypatch):
     """Step 5 of 12, while the batch of step 6 is made; every fourth is saved: nothing computed is computed again."""
     made = counting.targets

@@ -27,6 +27,7 @@ def directories(folder: Path) -> list[Path]:
     return sorted(p for p in (folder / "coin").iterdir() if not p.is_symlink())
 
 
+@pytest.mark.long
 def test_a_stopped_sweep_goes_on_and_runs_nothing_twice(workplace, monkeypatch, capsys):
     arguments = (*SWEEP, "--crash-at", "6")
     monkeypatch.setenv("COIN_CRASHES", "1")
@@ -71,6 +72,7 @@ def test_a_sweep_with_more_values_keeps_what_its_folder_holds(workplace, capsys)
     assert locate("coin", Path("mine")) == directories(Path("mine"))[-1].resolve()
 
 
+@pytest.mark.long
 def test_a_folder_of_another_sweep_and_damaged_runs_are_named(workplace, capsys):
     one = ("coin", "--steps", "1", "--seeds", "2", "--into", "mine", "--vary")
     assert sweep((*one, "toss.bias=0.1,0.9"), package=FAKES) == 0

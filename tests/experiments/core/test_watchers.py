@@ -99,6 +99,7 @@ def test_curves_take_their_share_of_the_time_and_pages_stay_fresh(tmp_path, cons
     context.close()
 
 
+@pytest.mark.long
 def test_the_report_replaces_the_page_of_a_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     latest, arguments = tmp_path / "runs/coin/latest", ["coin", "--crash-at", "2", "--seeds", "2"]

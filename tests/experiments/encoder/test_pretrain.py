@@ -42,6 +42,7 @@ class StoppedContext(Context):
         return super().done(stage)
 
 
+@pytest.mark.long
 def test_a_stopped_run_goes_on_and_is_measured_before_during_and_after(data, tmp_path):
     held_out, config = held_out_contacts(data, "test", DATA), dataclasses.replace(PRETRAIN, steps=4)
     for kind in (StoppedContext, Context):
@@ -64,6 +65,7 @@ def directory(tmp_path_factory, cache_dir):
     return run_shrunk(pretrain_encoder, config, tmp_path_factory.mktemp("runs"), "--cache-dir", str(cache_dir))
 
 
+@pytest.mark.long
 def test_everything_is_reported(directory):
     results = read_json(directory / "results.json")
     names = [r["name"] for r in results["requirements"]]
@@ -73,6 +75,7 @@ def test_everything_is_reported(directory):
     assert load_encoder(directory).notes == {"steps": 2, "source": "generated"}
 
 
+@pytest.mark.long
 def test_a_study_starts_from_it(directory, data, context):
     """Before the first step of SFT its encoder is the pretrained one, causal as it was trained."""
     model, tactile = starting_model(tiny.STUDY.model, directory, data.clip.sensors)

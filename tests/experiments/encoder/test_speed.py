@@ -31,6 +31,7 @@ def touched(p: int = 2, s: int = 2, f: int = 3, px: int = 28) -> TouchBatch:
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rest", ["drop", "merge"])
 def test_the_last_part_is_the_whole_encoder(rest):
     encoder: TactileViTConfig = dataclasses.replace(ENCODER, rest=rest, patch_cells=1, stem_px=14)

@@ -25,6 +25,7 @@ def here(work, *arguments, progress):
     return work(*arguments, progress=progress)
 
 
+@pytest.mark.long
 def test_experiment_runs_shrunken(tmp_path, monkeypatch):
     monkeypatch.setattr(load_checkpoints, "in_own_process", here)
     config = load_weights.LoadWeightsConfig(sizes=("tiny",), compare=("tiny",), scratch=tmp_path, shard_bytes=50_000)

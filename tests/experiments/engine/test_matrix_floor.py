@@ -32,6 +32,7 @@ def test_products_are_counted_through_loops():
     assert flops == {3: 2 * 2 * 4 * 4, 7: 2 * 5 * 2 * 4 * 3}
 
 
+@pytest.mark.long
 def test_the_work_of_the_job_grows_with_the_prefix_as_it_must():
     """What the job multiplies grows with the prefix by what it needs for each prompt token, but for the last layer.
 

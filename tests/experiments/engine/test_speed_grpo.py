@@ -31,6 +31,7 @@ def test_the_second_process_reads_what_the_first_compiled(tmp_path):
     assert sorted(p.name for p in tmp_path.rglob("*-cache")) == kept
 
 
+@pytest.mark.long
 def test_seeds_share_a_program_that_serves_all_steps():
     one, two = (Job(TINY, 16, config_of(TINY), seed=seed) for seed in (0, 1))
     assert (one.batch.ids != two.batch.ids).any()

@@ -21,6 +21,7 @@ from tests.touchr1_jax.rl.test_alarms import HEALTHY
 from touchr1_jax.rl.alarms import WINDOW
 
 
+@pytest.mark.long
 def test_the_adversary_finds_answers_under_the_published_rewards_and_none_under_stable():
     table, better = adversary_table(), dict[str, list[int]]()
     for presets, *_, count in table.rows:

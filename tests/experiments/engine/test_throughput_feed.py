@@ -27,6 +27,7 @@ def results(cache_dir, tmp_path_factory):
     return findings
 
 
+@pytest.mark.long
 def test_every_feed_of_a_scale_is_held_to_the_bound(results):
     assert [r.name for r in results.requirements] == [
         "tiny, sft, memory: device stands still",

@@ -34,6 +34,7 @@ def results(tmp_path_factory):
     return read_json(directory / "results.json")
 
 
+@pytest.mark.long
 def test_all_counts_are_exact(results):
     timed = {  # by the clock, by the process
         "Tac3D message decoded",

@@ -33,6 +33,7 @@ def test_the_bound_of_a_window_is_that_of_its_gradient():
     assert bound_px(roof, light_and_strain=True) > expected
 
 
+@pytest.mark.long
 def test_points_anchored_to_the_picture_at_rest_do_not_drift():
     section = assemble(drift_section(gels(None, 1), cycles=(1, 10), pairs=3, period=6), {})
     assert section.requirements[1].met

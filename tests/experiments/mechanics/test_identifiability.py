@@ -19,6 +19,7 @@ SCENES = SceneConfig(objects=8, sites=1, frames=3, min_force_n=0.3, max_force_n=
 PROBE = ProbeConfig(folds=4, iterations=20)
 
 
+@pytest.mark.long
 def test_features_repeat_whatever_the_batch_and_grow_with_noise():
     order, tier = SENSORS.index("tac3d"), ContactTier(name="", grid=24)
     draws = identify_presses.drawn_presses(SCENES, order)[:3]
@@ -30,6 +31,7 @@ def test_features_repeat_whatever_the_batch_and_grow_with_noise():
     assert np.abs(two.features[:, 1] - two.features[:, 0]).max() > 0.1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("order", [SENSORS.index("gelsight_mini"), SENSORS.index("tac3d")])
 def test_a_press_is_the_generators_own(order):
     tier = ContactTier(name="", grid=SCENES.contact_grid, tolerance=SCENES.solver_tolerance)
@@ -86,6 +88,7 @@ def questions():
     return features, labels, objects
 
 
+@pytest.mark.long
 def test_reading_the_training_records_is_cross_fitting(questions):
     features, labels, objects = questions
     own, again = identify_probes.transfer(features, [features], labels, objects, PROBE)

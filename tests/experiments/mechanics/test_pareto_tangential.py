@@ -28,6 +28,7 @@ def test_closed_forms_are_kept(context):
     assert off["Cattaneo–Mindlin: traction"] < 0.08
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("task", ["slide", "twist"])
 def test_two_solvers_meet_at_the_exact_traction(contacts, task):
     kernels, cases, _ = contacts

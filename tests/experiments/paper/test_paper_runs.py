@@ -61,6 +61,7 @@ def results(directory):
     return read_json(directory / "results.json")
 
 
+@pytest.mark.long
 def test_results_hold_every_arm_and_baseline(results, directory):
     assert (list(results["arms"]), list(results["baselines"])) == (ARMS, BASELINES)
     for name, row in {**results["arms"], **results["baselines"]}.items():
@@ -113,6 +114,7 @@ def test_results_tell_data_and_the_time_of_every_stage(results, directory):
     assert all("held_out" in line for line in read_metrics(directory) if line["stage"].startswith("decoder/"))
 
 
+@pytest.mark.long
 def test_a_run_without_results_goes_on_from_the_answers_that_are_whole(results, home, cache_dir, directory, capsys):
     damaged, *answers = sorted((directory / "answers").glob("*.npz"))
     assert len(answers) == 2 * (len(ARMS) + 1) - 1

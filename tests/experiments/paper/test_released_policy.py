@@ -30,6 +30,7 @@ from touchr1_jax.models.saved_policy import PolicyError, PolicyInput, SavedPolic
 SFT = StudySFT(batch_size=3, questions=2, micro_contacts=1)
 
 
+@pytest.mark.long
 def test_the_system_says_what_an_answer_looks_like(policy):
     said = instruction(policy.language)
     assert said in policy.tokenizer.decode(policy.layout.ids[0])
@@ -58,6 +59,7 @@ def test_a_mesh_that_cannot_share_the_work_is_named_before_there_is_data(policy,
         grpo_shape(SMOKE, policy, mesh)
 
 
+@pytest.mark.long
 def test_the_released_towers_are_taken_as_they_are(policy, streamed, checkpoint):
     params = policy.init(0, tiny.one_batch(streamed))
     assert params["decoder"] is checkpoint.params["decoder"]
@@ -104,6 +106,7 @@ def first_logits(policy, params, batch):
     return np.asarray(logits(params, batch))
 
 
+@pytest.mark.long
 def test_a_written_policy_describes_itself(folder, saved):
     """Parameters bit by bit, adapters of both towers among them, from the folder and the released weights alone."""
     tensors = {"adapter_model.safetensors", "touch_encoder.safetensors"}
@@ -115,6 +118,7 @@ def test_a_written_policy_describes_itself(folder, saved):
     assert (found.reads, found.notes, found.sensors) == (saved.reads, saved.notes, saved.sensors)
 
 
+@pytest.mark.long
 def test_an_export_computes_the_same_from_the_released_format(folder, saved, streamed, tmp_path, capsys):
     kept = export_merged(tmp_path / "merged", saved, jnp.dtype(jnp.float32))
     assert kept == pytest.approx(1, abs=1e-5)

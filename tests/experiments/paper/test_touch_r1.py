@@ -24,6 +24,7 @@ from touchr1_jax.models.load import load_checkpoint
 from touchr1_jax.models.released_policy import build_released_policy
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("weights", "message"),
     [
@@ -38,6 +39,7 @@ def test_a_folder_without_weights_is_named_before_data_are_made(tmp_path, capsys
     assert not list((tmp_path / "data").glob("scenes-*"))
 
 
+@pytest.mark.long
 def test_a_server_that_is_not_there_is_named_before_data_are_made(tmp_path, weights, capsys):
     places = ["--runs-dir", str(tmp_path / "runs"), "--cache-dir", str(tmp_path / "data")]
     server = ["--rollouts.url", "http://127.0.0.1:9", "--rollouts.tries", "1"]

@@ -66,6 +66,7 @@ def trained(tmp_path_factory):
     return videos, learned
 
 
+@pytest.mark.long
 def test_answers_follow_the_evidence(trained):
     videos, learned = trained
     found = answer_log_probs(learned, videos)
@@ -85,6 +86,7 @@ def test_a_policy_read_back_answers_the_same(trained, tmp_path):
         load(tmp_path / "other.npz", CONFIG)
 
 
+@pytest.mark.long
 def test_training_resumes_from_its_checkpoint(tmp_path):
     """A finished stage is not trained again, and its log is not written twice."""
     policy, lesson, config = description_policy(SHAPE), reading_lesson(1, 64, 0), TuneConfig(steps=3, optimizer=FAST)
@@ -101,6 +103,7 @@ def test_training_resumes_from_its_checkpoint(tmp_path):
     assert [line["step"] for line in read_metrics(tmp_path)] == [0, 1, 2]
 
 
+@pytest.mark.long
 def test_every_answer_fits_and_parses():
     policy = description_policy(SHAPE)
     assert policy.answers.shape == (27, 27, LENGTH)
@@ -124,6 +127,7 @@ def test_conclusions_from_made_up_evidence_follow_the_mean_of_the_touches_that_e
     np.testing.assert_allclose(lesson.target, mean**3 / (mean**3).sum(-1, keepdims=True), atol=5e-3)
 
 
+@pytest.mark.long
 def test_a_touch_that_does_not_exist_changes_nothing():
     policy = description_policy(dataclasses.replace(SHAPE, contacts=3))
     params = jax.tree.map(lambda x: x[None], policy.fresh(jax.random.key(0), 9))
@@ -137,6 +141,7 @@ def test_a_touch_that_does_not_exist_changes_nothing():
     assert (features.touch_time[:, 0, 1:] == -1).all()
 
 
+@pytest.mark.long
 def test_several_touches_of_an_object_are_one_question(trained, tmp_path):
     videos, learned = trained
     config = dataclasses.replace(CONFIG, shape=dataclasses.replace(SHAPE, contacts=2), tune=TuneConfig(steps=2))

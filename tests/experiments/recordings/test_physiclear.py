@@ -53,6 +53,7 @@ def run(tmp_path_factory, cache_dir):
     return home, data, only_run(home / "runs", "physiclear"), places
 
 
+@pytest.mark.long
 def test_every_video_is_answered_by_a_policy_that_never_met_its_object(run):
     _, _, directory, _ = run
     results = read_json(directory / "results.json")
@@ -65,6 +66,7 @@ def test_every_video_is_answered_by_a_policy_that_never_met_its_object(run):
     assert (directory / "plots" / "confusions.svg").stat().st_size > 1000
 
 
+@pytest.mark.long
 def test_a_kept_policy_answers_for_a_folder(run):
     home, data, directory, places = run
     unseen = home / "unseen"

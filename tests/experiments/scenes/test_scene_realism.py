@@ -71,6 +71,7 @@ def test_the_fit_finds_the_optics_that_made_the_pictures(recordings: Path, tmp_p
     assert len(made["READ_NOISE"]) == len(made["SHOT_NOISE"]) == len(made["GRAIN"]) == 3
 
 
+@pytest.mark.long
 def test_shadows_that_were_not_cast_explain_nothing(recordings: Path, context: Context) -> None:
     presses = realism_fit.read(recordings, image_px=48)
     study = realism_fit.fit(presses, context)

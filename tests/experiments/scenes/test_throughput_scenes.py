@@ -96,6 +96,7 @@ def test_a_writer_is_killed_at_random_moments_and_goes_on(tmp_path):
     assert len(list(out.iterdir())) == 6
 
 
+@pytest.mark.long
 def test_force_predicts_hardness_when_frames_are_dropped_and_not_when_matched(cheap):
     config = SceneConfig(objects=300, sequences=4 * 600, seed=17)  # plans are cached by config: this one is used once
     dropped, rigid, kept, matched = throughput_scenes.force_leaks(config)

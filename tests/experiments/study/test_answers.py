@@ -64,6 +64,7 @@ def ask(policy, params):
 LABEL = np.array([[0, 1, 2, 8], [2, 1, 0, 0], [1, 1, 1, 4]], np.int32)
 
 
+@pytest.mark.long
 def test_padding_the_last_block_changes_nothing(policy, ask):
     features = tiny.features(3)
     whole, padded = (ask(jax.tree.map(lambda x, n=n: x[:n], features), LABEL[:n]) for n in (2, 3))
@@ -77,6 +78,7 @@ def test_padding_the_last_block_changes_nothing(policy, ask):
     assert len(np.unique(padded.tokens, axis=0)) > 1, "a policy that says one thing tests nothing"
 
 
+@pytest.mark.long
 def test_the_marginal_is_the_mean_over_traces_of_the_levels_that_may_follow(policy, params):
     """As the learner's forward pass scores them; under the grammar every trace concludes."""
     contact, attribute = np.divmod(np.arange(8), 4)

@@ -54,6 +54,7 @@ def first(sft):
     return sft("first")
 
 
+@pytest.mark.long
 def test_another_run_finds_the_parameters_and_the_log(sft, first, home):
     params, files = sft("second")
     assert files == first[1]

@@ -37,6 +37,7 @@ def probed(data):
     return ProbeFeatures(streams=streams, present=present, force=np.zeros((n, 1), np.float32))
 
 
+@pytest.mark.long
 def test_evidence_of_recorded_touch_is_a_distribution_and_of_the_rest_nothing(data, probed, context):
     evidence = gather_evidence(data, probed, PROBE, context)
     train = np.isin(np.arange(len(data.store)), np.concatenate([data.parts["sft"], data.parts["grpo"]]))
@@ -64,6 +65,7 @@ def evidence(data):
     return np.zeros((len(data.store), len(data.clip.sensors), data.label.shape[1], 9), np.float32)
 
 
+@pytest.mark.long
 def test_adapters_on_rows_are_trained_beside_a_decoder_that_stands_still(policy, data, evidence, context):
     adapting = with_lora(policy, LoraConfig(rank=2))
     config = StudySFT(steps=3, batch_size=4, pack=WIDTH)
@@ -87,6 +89,7 @@ def test_a_curriculum_is_a_share_of_the_steps(policy, data, evidence):
     assert not np.asarray(plain).all()
 
 
+@pytest.mark.long
 def test_the_decoders_phase_trains_the_decoder_alone_and_returns_its_best_point(
     policy, data, params, evidence, tmp_path
 ):

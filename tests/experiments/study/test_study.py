@@ -115,6 +115,7 @@ def test_a_constant_scores_what_its_label_share_is(study):
     assert (scores["middle_rate"], scores["parse_rate"], scores["csc_agree"], scores["csc_slot"]) == (100,) * 4
 
 
+@pytest.mark.long
 def test_every_baseline_answers_the_questions_of_the_policies(study):
     rows = baselines(study)
     assert list(rows) == ["constant", "constant_joint", "constant_middle", "force_only"]
@@ -188,6 +189,7 @@ def test_sizes_that_contradict_each_other_are_named_without_data(part, changes, 
         check_model(dataclasses.replace(model, **{part: dataclasses.replace(getattr(model, part), **changes)}), SENSORS)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("content", [None, b"", b"no archive"])
 def test_a_file_that_is_no_encoder_is_named_before_data_are_made(content, tmp_path, capsys):
     path = tmp_path / "encoder.npz"

@@ -66,6 +66,7 @@ def test_extract_writes_arrays_over_frames(real: pathlib.Path, tmp_path: pathlib
         assert str(fields["calibration"]) == Calibration.load(real).hash
 
 
+@pytest.mark.long
 def test_the_order_of_the_presses_changes_no_bit(presses: BallPresses) -> None:
     order = np.random.default_rng(2).permutation(len(presses))
     named = np.array(names(presses))

@@ -66,6 +66,7 @@ def test_a_replay_that_ends_leaves_its_contact_in_the_records(tmp_path, press, c
     assert -made.force_n[:, 2].min() == pytest.approx(3.0, abs=0.1)
 
 
+@pytest.mark.long
 def test_ctrl_c_ends_a_recording_cleanly(tmp_path, press):
     out = tmp_path / "records"
     command = [sys.executable, "-m", "sensors_io", "record", "--out", str(out), "--object-id", "cup"]
@@ -119,6 +120,7 @@ def poses(tmp_path):
     return save(tmp_path / "HDL1.npz", 1000, [1.0, -2.0, 3.0] + 1.5 * down, moment)
 
 
+@pytest.mark.long
 def test_force_zero_from_static_poses(tmp_path, poses, capsys):
     """The recording is repeated until all poses are found, so that readings lost on a busy machine come again."""
     args = ["force-zero", "--out", tmp_path / "g.json", "--hold-s", 0.03, "replay", "--path", poses]
@@ -132,6 +134,7 @@ def test_force_zero_from_static_poses(tmp_path, poses, capsys):
     assert "of 9 poses" in capsys.readouterr().err.replace("\n", " ")
 
 
+@pytest.mark.long
 def test_sync_and_its_check(tmp_path, capsys):
     """A film and a force recording of the same taps; the film is replayed beside it, so that little is left over."""
     at = np.cumsum([0.3, 0.45, 0.35, 0.5])

@@ -6,6 +6,7 @@ import shlex
 
 import cv2
 import numpy as np
+import pytest
 
 from sensors_io.__main__ import main
 
@@ -13,6 +14,7 @@ ROOT = pathlib.Path(__file__).parents[3]
 CLIPS = ROOT / "tests" / "data" / "gelslam"
 
 
+@pytest.mark.long
 def test_the_commands_of_the_readme_lead_to_a_depth_map(tmp_path: pathlib.Path) -> None:
     """14 presses, recorded at a third of the width: the pitch is three times the README's."""
     camera = tmp_path / "camera"

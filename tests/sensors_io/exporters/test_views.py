@@ -82,6 +82,7 @@ def test_depth_of_a_file_becomes_surfaces(tmp_path, capsys):
         assert "lies in the folder of the records" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_a_rerun_recording_loads_and_has_its_entities(tmp_path, selected):
     pytest.importorskip("rerun")
     export_rerun(selected, tmp_path / "a.rrd", SILENT)

@@ -132,6 +132,7 @@ def test_a_survey_by_hand() -> None:
     assert float(seen.radius_mm) == pytest.approx(4 / np.sqrt(np.pi))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("gap", [_ball, _bumps])
 def test_the_promise_is_kept(gap) -> None:
     """Against 192² at a tight tolerance; the displacement is compared on the chosen grid."""
@@ -146,6 +147,7 @@ def test_the_promise_is_kept(gap) -> None:
     assert np.linalg.norm(found.displacement_mm - true) <= SLACK * 0.1 * np.linalg.norm(true)
 
 
+@pytest.mark.long
 def test_many_scenes_are_solved_as_each_alone() -> None:
     forces, moduli = np.array([1.0, 6.0, 12.0]), np.array([0.5, 3.0, 50.0])
     shapes = (_ball, _bumps, _bumps)

@@ -37,6 +37,7 @@ def _assert_same(a: list[Sequence], b: list[Sequence]) -> None:
             np.testing.assert_array_equal(array, _arrays(right)[name], err_msg=name)
 
 
+@pytest.mark.long
 def test_generation_resumes_anywhere_with_the_same_values(some: list[list[Sequence]]) -> None:
     whole = list(itertools.islice(contacts(SMALL), 5))
     tail = list(itertools.islice(contacts(SMALL, start=2), 3))

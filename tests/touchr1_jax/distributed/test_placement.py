@@ -38,6 +38,7 @@ def test_a_placed_state_has_buffers_of_its_own():
     assert after["key"] == state["key"]
 
 
+@pytest.mark.long
 def test_a_stage_on_a_mesh_computes_what_one_device_does_and_compiles_its_step_once():
     problem, devices, traced = words(), DeviceMesh(MESH), []
 

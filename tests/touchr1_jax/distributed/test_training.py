@@ -52,6 +52,7 @@ def same(found: dict, expected: list[dict[str, float]]) -> None:
     assert np.ptp(losses) > 100 * TOLERANCE
 
 
+@pytest.mark.long
 def test_losses_on_a_mixed_mesh_and_after_resuming_on_one_device(tmp_path):
     """Eight devices train twenty steps; this process, which has one, goes on from their tenth."""
     worker = start("words", MESHES["mixed"], tmp_path, 8)

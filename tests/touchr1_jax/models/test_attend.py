@@ -100,6 +100,7 @@ def test_blocks_of_queries_see_what_the_whole_sees(rows):
 prefill = jax.jit(tiny.FNS.prefill, static_argnums=5)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("stream", range(tiny.S))
 def test_a_prompt_encoded_again_from_a_change_on_is_the_prompt_encoded_whole(stream):
     params = tiny.params()

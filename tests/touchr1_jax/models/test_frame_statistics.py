@@ -26,6 +26,7 @@ def by_hand(stream: np.ndarray, row: int, column: int, side: tuple[int, int]) ->
     return np.array([np.concatenate([*one, one[3] - found[0][3], one[4] - found[0][4]]) for one in found])
 
 
+@pytest.mark.long
 def test_statistics_equal_a_plain_computation():
     found = np.asarray(frame_statistics(jnp.asarray(FRAMES), 8))
     assert found.shape == (2, 3, 6, 21)

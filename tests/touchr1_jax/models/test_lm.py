@@ -36,6 +36,7 @@ def filled(value):
     return (rows,) * CONFIG.num_layers
 
 
+@pytest.mark.long
 def test_prefix_cache_knows_the_next_position(params):
     positions = jnp.array([[0, 9, 2, 3, 70], [0, 4, 2, 3, 70], [0, 1, 2, 3, 70]])
     mask = jnp.array([True, True, True, True, False])
@@ -44,6 +45,7 @@ def test_prefix_cache_knows_the_next_position(params):
     assert int(prefix.next_position) == 10  # after the largest id of any axis; the last token does not exist
 
 
+@pytest.mark.long
 def test_a_cache_for_each_layer_reads_as_one_for_all():
     """Three tokens through five layers whose caches are apart or together: the same hidden states."""
     config = dataclasses.replace(tiny.CONFIG.decoder, num_layers=5)

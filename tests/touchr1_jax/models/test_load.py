@@ -30,6 +30,7 @@ def test_everything_of_a_directory_is_read(directory):
     np.testing.assert_array_equal(found.params["decoder"]["embedding"]["embedding"], table)
 
 
+@pytest.mark.long
 def test_command_says_what_it_found(directory, capsys):
     assert Load(directory=directory).run() == 0
     said = capsys.readouterr().out

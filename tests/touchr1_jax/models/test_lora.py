@@ -80,6 +80,7 @@ def test_adapters_have_the_shapes_of_their_layers(base):
     assert 0.8 * bound < float(np.abs(a).max()) <= bound
 
 
+@pytest.mark.long
 def test_merged_parameters_compute_the_same(base):
     """Prompt, completion and their gradients by both ways; far from the base."""
     adapters = loud(init_adapters(jax.random.key(0), base, LORA))
@@ -103,6 +104,7 @@ def test_gradients_are_those_through_the_merged_parameters(base):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4 * float(np.abs(b).max()))
 
 
+@pytest.mark.long
 def test_layers_that_are_computed_twice_are_adapted_both_times(base):
     """Values and gradients of a policy that keeps little for its backward pass."""
     params = {"adapters": loud(init_adapters(jax.random.key(0), base, LORA))}

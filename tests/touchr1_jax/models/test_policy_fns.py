@@ -73,6 +73,7 @@ def close(ours, theirs, tolerance: float = 1e-5) -> None:
         assert float(jnp.linalg.norm(found - leaf)) <= tolerance * size, jax.tree_util.keystr(path)
 
 
+@pytest.mark.long
 def test_shared_prefix_gives_the_values_of_full_sequences(batch):
     tokens, params = tiny.completions(0, P, G, T), tiny.params()
     ours = group_logits(params, batch.features, batch.ids, batch.mask, tokens)[..., writable]
@@ -81,6 +82,7 @@ def test_shared_prefix_gives_the_values_of_full_sequences(batch):
     np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-5 * float(np.abs(theirs).max()))
 
 
+@pytest.mark.long
 def test_shared_prefix_gives_the_gradients_of_full_sequences(batch):
     tokens = tiny.completions(0, P, G, T)
     decoder = {"decoder": tiny.params()["decoder"]}
@@ -119,6 +121,7 @@ def test_greedy_completion_is_the_most_likely_token_at_every_step(batch):
     np.testing.assert_array_equal(jnp.where(said.mask, best, 0), jnp.where(said.mask, said.tokens, 0))
 
 
+@pytest.mark.long
 def test_banned_ids_are_never_sampled(batch):
     """10⁴ tokens; the policy's own scores prefer the banned ids by far."""
     params = tiny.params()

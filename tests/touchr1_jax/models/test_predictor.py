@@ -59,6 +59,7 @@ def test_it_is_told_when_and_how_hard(predict, inputs):
     assert changed(before, predict(latent, shown, index, force.at[:, :, 2].add(4)))[:, 2].all()
 
 
+@pytest.mark.long
 def test_a_fresh_predictor_copies_what_is_shown(inputs):
     latent, shown, *rest = inputs
     module = LatentPredictor(CONFIG, S)

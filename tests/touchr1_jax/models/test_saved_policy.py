@@ -38,6 +38,7 @@ def largest_error(saved, found) -> float:
     return max(jax.tree.leaves(errors))
 
 
+@pytest.mark.long
 def test_everything_survives(saved, folder):
     found = read_policy(folder)
     assert largest_error(saved, found) == 0

@@ -192,6 +192,7 @@ def encode_alone(config: TactileViTConfig, frames: np.ndarray, seed: int = 0):
     return jax.jit(lambda x: module.apply(params, x, *streams, method=TactileViT.encode))(jnp.asarray(frames))
 
 
+@pytest.mark.long
 def test_a_causal_encoder_does_not_look_ahead():
     frames = np.random.default_rng(0).uniform(0, 255, (F, H, W, 3)).astype(np.float32)
     later = frames.copy()

@@ -22,6 +22,7 @@ def spread_of_group(tokens, parsed, target):
     return jnp.std(parsed.length * 1.0, ddof=1) + 0.0 * parsed.length
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("levels", "sensors"), [((3, 3, 3, 9), S), ((2, 2, 2, 2), 1), ((2, 3, 5, 9), 2)])
 def test_every_reward_of_the_package_is_finite(levels, sensors):
     rewards = make_rewards(uniform_prior(levels))

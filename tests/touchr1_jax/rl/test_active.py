@@ -114,6 +114,7 @@ def experience(log_p: np.ndarray) -> Experience:
     )
 
 
+@pytest.mark.long
 def test_gradient_is_that_of_the_expected_reward(exact):
     log_p, expected = exact
     config = GRPOConfig(prompts=1, micro_prompts=1, group=len(PATHS), length=T, algorithm=DrGrpo(constrained=True))
@@ -128,6 +129,7 @@ def test_gradient_is_that_of_the_expected_reward(exact):
 STEP = GRPOConfig(prompts=4, group=4, length=T, micro_prompts=2, algorithm=Paper(constrained=True))
 
 
+@pytest.mark.long
 def test_one_program_serves_all_prices_and_batches():
     optimizer = optax.sgd(1e-3)
     step = make_active_step(SHALLOW.constrained_fns, optimizer, STEP, BUDGET)

@@ -177,6 +177,7 @@ def rewards():
     return jax.jit(lambda both: level_rewards(reward_of, LEVELS, both, target, sampled, counts))(both)
 
 
+@pytest.mark.long
 def test_rewards_of_every_conclusion_by_hand(rewards):
     """Label "hard": ordinal credit 0, .4, 1; the levels that hardness lacks earn 0, and a cut answer states none."""
     np.testing.assert_allclose(rewards.reward[0, 0], [0, 0.4, 1, *[0] * 6], atol=1e-6)

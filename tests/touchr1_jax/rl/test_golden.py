@@ -66,6 +66,7 @@ def lines() -> dict[str, list[float]]:
     return trajectory()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", json.loads(GOLDEN.read_text()) if GOLDEN.exists() else [])
 def test_default_step_computes_what_it_always_did(lines, name):
     np.testing.assert_allclose(lines[name], json.loads(GOLDEN.read_text())[name], rtol=2e-4, atol=2e-6)

@@ -67,6 +67,7 @@ def logits_of(experience: Experience) -> list[np.ndarray]:
     return [np.asarray(group_logits(p, f, b.ids, b.mask, experience.rollout.tokens)) for p, f in runs]
 
 
+@pytest.mark.long
 def test_loss_and_parts_equal_a_float64_reference(experience, whole):
     rollout = jax.tree.map(np.asarray, experience.rollout)
     terms = reference.terms(
@@ -110,6 +111,7 @@ def one_stream(experience) -> Experience:
     return experience._replace(masked_touch=jnp.where(chosen, other, own), masked_stream=stream)
 
 
+@pytest.mark.long
 def test_an_anchor_adds_the_likelihood_of_the_answers_and_its_gradient(experience, whole):
     """As if each answer were a completion alone; of the first prompt none is known."""
     b, tokens = experience.batch, tiny.completions(3, P, 1, T)
@@ -133,6 +135,7 @@ def test_an_anchor_adds_the_likelihood_of_the_answers_and_its_gradient(experienc
         gradient(anchored)(experience)
 
 
+@pytest.mark.long
 def test_stopped_branch_changes_the_gradient_but_no_value(one_stream):
     stopped = dataclasses.replace(CONFIG, algorithm=dataclasses.replace(ALGORITHM, grounding_stop_masked=True))
     (free, free_parts, _), (held, held_parts, _) = compute(one_stream, PARAMS), gradient(stopped)(one_stream)
@@ -148,6 +151,7 @@ def test_grounding_is_logged_for_every_stream(one_stream):
     np.testing.assert_allclose(by_stream, parts["grounding"], rtol=1e-5)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", Surrogate)
 def test_no_ratio_is_clipped_at_the_first_update_whatever_the_sampler_computed(experience, kind):
     """The sampler's log-probabilities are off by up to ±.6, the clip range is a millionth, and bfloat16 rounds."""
@@ -176,6 +180,7 @@ def test_under_a_cap_the_sampler_counts_in_the_weight_alone(experience):
     np.testing.assert_allclose(parts["surrogate"], gain.mean(), rtol=1e-4)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("change", "tolerance"),
     [

@@ -82,6 +82,7 @@ def run() -> Run:
     return Run()
 
 
+@pytest.mark.long
 def test_no_nan_under_debug_nans(run):
     """`debug_nans` looks at every array that leaves the program."""
     with jax.debug_nans(True):
@@ -100,6 +101,7 @@ def experience_of(before: GRPOState, batch):
 group_logits = jax.jit(jax.vmap(FNS.group_logits, in_axes=(None, 0, 0, 0, 0)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("i", [0, 1])
 def test_loss_equals_a_float64_reference(run, i):
     """Surrogate over the groups that differ − β k3 + γ G_tg over all; the step index is in the key."""
@@ -128,6 +130,7 @@ def test_loss_equals_a_float64_reference(run, i):
     np.testing.assert_allclose(run.metrics[i]["degenerate_share"], 1 - lively.mean(), rtol=1e-6)
 
 
+@pytest.mark.long
 def test_update_is_the_gradient_of_the_written_out_objective(run):
     """On policy the surrogate's value says nothing (advantages sum to 0), so the update is held to its gradient."""
     before, batch = run.before[0], run.batches[0]
@@ -230,6 +233,7 @@ def test_uncompiled_step_is_the_compiled_one(run):
     assert_first_step(run, end, metrics)
 
 
+@pytest.mark.long
 def test_weights_are_gathered_for_the_sampler_and_not_for_the_learner(run):
     """A gather that returns zeros makes the sampler uniform; the learner's weights, and its gradient, stay."""
     gathered = []

@@ -33,6 +33,7 @@ def worth(tokens, target):
     return jnp.where(target.asked[0], value, reward), {**terms, "spread": spread}, parsed
 
 
+@pytest.mark.long
 def test_a_reward_that_is_nan_costs_its_group_and_nothing_else():
     """The step is that of a group whose rewards are all equal, which teaches nothing either."""
     step, batch = make_grpo_step(FNS, worth, OPTIMIZER, CONFIG), tiny.question_batch(1, P)
@@ -106,6 +107,7 @@ def test_finite_gradients_reach_it_as_they_are():
     jax.tree.map(np.testing.assert_array_equal, found, (optax.apply_updates(PARAMS, updates), after))
 
 
+@pytest.mark.long
 def test_dynamic_sampling_logs_what_it_passed_over():
     """Its candidates' metrics are those of a step that learns from all; the selected ones hide constant groups."""
 

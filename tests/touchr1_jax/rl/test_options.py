@@ -60,6 +60,7 @@ def lagging():
     return states, found
 
 
+@pytest.mark.long
 def test_a_lagging_sampler_draws_with_the_parameters_before_the_last_update(on_policy, lagging):
     """At step 1 it says what the first parameters say there; the learner by then says something else."""
     step, after, _ = on_policy
@@ -73,6 +74,7 @@ def test_a_lagging_sampler_draws_with_the_parameters_before_the_last_update(on_p
     assert early.behind == after.behind == ()
 
 
+@pytest.mark.long
 def test_without_an_update_in_between_bfloat16_clips_nothing_though_the_sampler_lags():
     """The old log-probabilities are those of the learner's pass with the parameters that sampled."""
     algorithm = Gspo(stale=1, clip_low=1e-5, clip_high=1e-5)
@@ -83,6 +85,7 @@ def test_without_an_update_in_between_bfloat16_clips_nothing_though_the_sampler_
     assert metrics["sampler_gap_peak"] > 1e-4
 
 
+@pytest.mark.long
 def test_without_a_lag_the_step_is_on_policy(on_policy):
     """At the first step a lagging sampler has not fallen behind yet."""
     _, after, metrics = on_policy
@@ -120,6 +123,7 @@ def first_kl(state):
     return rollout, kl
 
 
+@pytest.mark.long
 def test_the_kl_in_the_reward_is_a_term_of_it(lagging):
     """−β Σ_t log(π/π_ref) of the rollouts, from log-probabilities of their own; the loss has no KL then."""
     state, metrics = lagging[0][0], lagging[1][0]
@@ -130,6 +134,7 @@ def test_the_kl_in_the_reward_is_a_term_of_it(lagging):
     assert metrics["kl"] == metrics["kl_cost_peak"] == 0
 
 
+@pytest.mark.long
 def test_a_group_that_is_left_out_has_the_mean_kl_of_the_others():
     """Its reward is no number; a statistic over the batch sees the others alone."""
     left_out = np.asarray(BATCH.target.asked[:, 0])
@@ -150,6 +155,7 @@ CUT_OFF, EQUAL = 3, 6
 """Added to the label of a question: its rollouts are truncated; all are paid the same."""
 
 
+@pytest.mark.long
 def test_truncated_rollouts_are_out_of_the_loss():
     """Where every rollout is cut off nothing is learned, where only one prompt's are, it alone."""
 
@@ -184,6 +190,7 @@ def learn() -> Experience:
     return Experience(BATCH, BATCH.features.touch, stream, off, off.log_prob, advantage, jnp.full(P, 1 / P))
 
 
+@pytest.mark.long
 def test_a_bucket_holds_the_longest_rollout(learn):
     """Whether the longest rollout has 3 or 4 tokens, a gradient in buckets is that over all tokens."""
     tokens = jnp.arange(T)
@@ -198,6 +205,7 @@ def test_a_bucket_holds_the_longest_rollout(learn):
         close(old[mask], before[mask], rtol=1e-6)
 
 
+@pytest.mark.long
 def test_parts_of_several_updates_are_those_of_the_first(learn):
     """But the share of clipped tokens is that of the last, which is off policy at a large rate."""
     optimizer = optax.sgd(30.0)
@@ -223,6 +231,7 @@ def test_the_trust_region_does_not_count_the_lag_of_the_sampler(learn, minibatch
     assert parts["update_scale"] == 1
 
 
+@pytest.mark.long
 def test_minibatches_take_a_step_each_and_together_that_of_the_batch(learn):
     """At a small rate two halves move twice as far as the whole; at a large one the second is off policy.
 
@@ -280,6 +289,7 @@ def test_nucleus_by_hand(top_p, min_p, kept):
     np.testing.assert_allclose(drawn, np.log(0.5 / share), rtol=1e-5)
 
 
+@pytest.mark.long
 def test_the_learner_scores_what_was_sampled_as_the_sampler_did():
     """At a temperature and from a nucleus; without these settings it would be off by tenths of a nat."""
     config = dataclasses.replace(CONFIG, group=8, temperature=0.7, top_p=0.8, min_p=0.05)

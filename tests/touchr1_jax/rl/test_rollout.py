@@ -53,6 +53,7 @@ def test_tokens_masks_and_log_probabilities_of_a_script(said):
     np.testing.assert_allclose(said.log_prob, np.where(said.mask, peak, 0), atol=1e-6)
 
 
+@pytest.mark.long
 def test_loop_ends_with_the_last_rollout():
     """Without compilation the loop runs in Python and can be counted: one call per token up to the last end token."""
     calls = []
@@ -138,6 +139,7 @@ def test_end_token_is_counted_and_nothing_after_it(end):
     assert not said.log_prob[0, 0, 1:].any()
 
 
+@pytest.mark.long
 def test_greedy_answers_are_parsed_and_begin_with_the_most_likely_token():
     params, batch = tiny.shallow_params(), tiny.question_batch(1, 2)
     parser = compile_parser(tiny.LANGUAGE, tiny.TOKENIZER)

@@ -76,6 +76,7 @@ ENDS = HostReward(lambda text, parsed, target: float(text.endswith("</conclude>"
 """1 where the text ends well, and the label of the first attribute."""
 
 
+@pytest.mark.long
 def test_a_reward_may_see_the_tokens_of_the_whole_group():
     score = make_score(PARSER, {"rank": RANK}, {"rank": 2.0})
     reward, _, _ = jax.vmap(jax.vmap(score, in_axes=(0, None), axis_name=GROUP))(TOKENS, TARGET)

@@ -22,6 +22,7 @@ def influence():
     return jax.jit(run)
 
 
+@pytest.mark.long
 def test_every_stream_that_is_read_moves_the_answers(influence):
     size, present = jax.device_get(influence(BATCH, NOISE))
     assert present.all()

@@ -86,6 +86,7 @@ def test_the_bar_is_the_best_control_that_counts():
     assert bar(control, jnp.zeros(3, bool)) == 1  # nothing passes where no control could be made
 
 
+@pytest.mark.long
 def test_bonuses_and_their_metrics_by_hand():
     """Of three groups one is right, and no control ever is."""
     batch = tiny.question_batch(0, 3)

@@ -35,6 +35,7 @@ def legal():
     return explore(POLICY.constrained_fns, explored.batch_of(*OBJECTS))
 
 
+@pytest.mark.long
 def test_sampler_and_learner_agree(found):
     fns, batch, said = found
     config = GRPOConfig(prompts=len(OBJECTS), group=GROUP, length=explored.T, algorithm=DrGrpo())
@@ -80,6 +81,7 @@ def test_a_malformed_turn_ends_the_trajectory_without_an_answer():
     np.testing.assert_array_equal(turns, (np.asarray(said.action) >= 0).sum(-1) + 1)
 
 
+@pytest.mark.long
 def test_the_most_likely_trajectory_needs_no_key():
     run = make_explore(POLICY.constrained_fns, BUDGET)
     bank, batch = jax.tree.map(jnp.asarray, BANK), explored.batch_of(*OBJECTS)

@@ -37,6 +37,7 @@ def shorten(learn):
     return jax.jit(lambda size: within_trust(FNS, CONFIG, BEFORE, along(size), learn, DELTA))
 
 
+@pytest.mark.long
 def test_the_policy_that_sampled_has_the_sampled_log_probabilities(learn):
     ours = jax.jit(lambda: log_probs(FNS, CONFIG, BEFORE, learn.batch, learn.rollout))()
     mask = np.asarray(learn.rollout.mask)

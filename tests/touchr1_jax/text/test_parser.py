@@ -38,6 +38,7 @@ def assert_same(parsed, reading) -> None:
         assert np.asarray(getattr(parsed, field.name)).tolist() == getattr(reading, field.name), field.name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("language", LANGUAGES)
 @pytest.mark.parametrize("kind", LENGTH)
 def test_parser_equals_oracle_on_any_tokens(kind, language):
@@ -161,6 +162,7 @@ def test_truncated_answer_is_read_as_it_stands():
     assert not parse(GOOD[:-1], end=False).formatted
 
 
+@pytest.mark.long
 def test_tokens_belong_to_the_segment_that_is_not_over():
     """A closing tag ends its own segment; one of `compare` before that of `perceive` ends none."""
     tokenizer = word_level(TOUCH_LANGUAGE)

@@ -93,12 +93,14 @@ def test_covariance_by_hand():
     np.testing.assert_allclose(covariance_of(padded, exists), 4.0, rtol=1e-6)
 
 
+@pytest.mark.long
 def test_loss_is_the_sum_of_its_terms(state, batch, graded):
     guards = Guards(variance=2.0, covariance=0.5)
     (value, m), _ = graded(state.params, state.target, batch, SHOWN, guards)
     np.testing.assert_allclose(value, m["prediction"] + 2 * m["variance_term"] + 0.5 * m["covariance_term"], rtol=1e-6)
 
 
+@pytest.mark.long
 def test_the_target_gets_no_gradient_unless_it_leaks(state, batch, graded):
     """The gradient through a leak of one is that of a target that is the encoder itself."""
     bare = Guards(variance=0.0, covariance=0.0)
@@ -140,6 +142,7 @@ def test_shown_streams_are_present_and_never_none():
     np.testing.assert_array_equal(random_shown(jax.random.key(0), present, 1.0), present)
 
 
+@pytest.mark.long
 def test_prediction_is_learned_in_one_trace(state, batch):
     step = make_dynamics_step(CONFIG, OPTIMIZER)
     state = jax.tree.map(jnp.array, state)  # the step gives its buffers away
@@ -158,6 +161,7 @@ def test_prediction_is_learned_in_one_trace(state, batch):
     assert max(changed) > 1e-3
 
 
+@pytest.mark.long
 def test_the_target_is_the_moving_average(state, batch):
     step = make_dynamics_step(CONFIG, OPTIMIZER, Guards(ema=0.75))
     copy = jax.tree.map(jnp.array, state)

@@ -79,6 +79,7 @@ def test_whole_motions_and_sensors_drop_out():
     assert 0.2 < 1 - stays.any(2).mean() < 0.35
 
 
+@pytest.mark.long
 def test_both_stages_run_and_learn():
     bank = jax.tree.map(jnp.asarray, WHOLE)
     sft = SFTConfig(

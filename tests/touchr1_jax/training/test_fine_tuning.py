@@ -39,6 +39,7 @@ def started():
     return start_fine_tuning(CONFIG, OPTIMIZER, encoder, batch), batch
 
 
+@pytest.mark.long
 def test_an_untrained_head_is_even_and_gives_no_level_that_is_not_there(started):
     state, batch = started
     p = np.exp(level_log_probs(CONFIG, state.params, batch))

@@ -111,6 +111,7 @@ def padding(params, batch):
     return gradient(None)(params, batch)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("micro", "contacts", "width"), [(None, 4, WIDTH), (2, 1, N)], ids=["all", "alone"])
 def test_rows_teach_what_padding_teaches(params, batch, padding, micro, contacts, width):
     """Loss, token accuracy and every gradient, whoever shares the rows."""
@@ -118,6 +119,7 @@ def test_rows_teach_what_padding_teaches(params, batch, padding, micro, contacts
     assert_same(gradient(micro)(params, packed(batch, packing)), padding)
 
 
+@pytest.mark.long
 def test_a_blind_policy_is_packed_too(params, batch):
     unfelt = batch.replace(streams=np.zeros_like(batch.streams))
     rows = packed(unfelt, Packing(width=WIDTH, contacts=4))
@@ -135,6 +137,7 @@ def test_answers_of_which_a_part_counts_teach_that_part(params, batch):
     assert examples.tolist() == [0, 1, 2, 4, 5, 6, 7]
 
 
+@pytest.mark.long
 def test_blocks_of_logits_and_rematerialisation_change_nothing(params, batch, padding):
     rows = packed(batch, Packing(width=WIDTH, contacts=4))
     lean = dataclasses.replace(FNS, module=FNS.module.clone(remat=True))
@@ -142,6 +145,7 @@ def test_blocks_of_logits_and_rematerialisation_change_nothing(params, batch, pa
     assert_same(found, padding)
 
 
+@pytest.mark.long
 def test_adapters_learn_from_rows_what_they_learn_from_padding(params, batch):
     lora = LoraConfig(rank=2)
     fns = dataclasses.replace(FNS, lora=lora, base=params)
@@ -199,6 +203,7 @@ def test_no_input_of_an_example_changes_another(batch, scores):
             assert (after[examples == example] != before[examples == example]).any()
 
 
+@pytest.mark.long
 def test_blocks_of_queries_see_all_keys_within_reach(monkeypatch):
     """Nine queries in blocks of two, examples of four tokens at most: as all at once."""
     rng = np.random.default_rng(0)
@@ -214,6 +219,7 @@ def test_blocks_of_queries_see_all_keys_within_reach(monkeypatch):
     assert np.flatnonzero(np.abs(short - whole).max(-1) > 1e-3).tolist() == [2, 3, 6]  # who lost keys of their own
 
 
+@pytest.mark.long
 def test_one_program_for_batches_that_fill_other_rows(params):
     """Five batches, of which one fills a single row, and the losses of padding."""
     optimizer = optax.sgd(0.0)

@@ -60,6 +60,7 @@ def assert_same_gradient(found, expected) -> None:
         np.testing.assert_allclose(a, b, atol=1e-5 * scale)
 
 
+@pytest.mark.long
 def test_encoded_contacts_train_the_decoder_as_the_contacts_do_and_nothing_else(params, batch):
     features = jax.jit(lambda p, b: FNS.encode(p, b))(params, batch.touch)
     (value, right), whole = gradient(params, batch)
@@ -70,6 +71,7 @@ def test_encoded_contacts_train_the_decoder_as_the_contacts_do_and_nothing_else(
         np.testing.assert_allclose(a, b, atol=1e-6)
 
 
+@pytest.mark.long
 def test_loss_is_the_cross_entropy_of_the_answers_by_hand(params, batch):
     """In float64 from the logits of one prompt and answer at a time."""
     features = jax.jit(lambda p, b: FNS.encode(p, b))(params, batch.touch)
@@ -89,6 +91,7 @@ def test_loss_is_the_cross_entropy_of_the_answers_by_hand(params, batch):
     np.testing.assert_allclose(accuracy, right / count, rtol=1e-6)
 
 
+@pytest.mark.long
 def test_blocks_of_tokens_give_the_loss_of_all_of_them(params, batch):
     """And the same gradient, five tokens' logits at a time."""
     few = jax.jit(jax.value_and_grad(lambda p: sft_loss(FNS, p, batch, max_logits=5 * tiny.V)[0]))(params)
@@ -97,6 +100,7 @@ def test_blocks_of_tokens_give_the_loss_of_all_of_them(params, batch):
     assert_same_gradient(few[1], all_at_once[1])
 
 
+@pytest.mark.long
 def test_micro_batches_sum_to_the_gradient_of_the_batch(params, batch):
     """With unequal numbers of answer tokens: the mean is over the tokens of the batch, not of each micro-batch."""
     uneven = batch.replace(token_mask=batch.token_mask.at[1, 1].set(False).at[0, 0, 5:].set(False))

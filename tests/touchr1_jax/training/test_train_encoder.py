@@ -55,6 +55,7 @@ def initial():
     return jax.jit(functools.partial(POLICY.init, 0))(jax.tree.map(lambda x: x[:1], contacts(1)))
 
 
+@pytest.mark.long
 def test_the_encoders_learn_and_the_decoder_stays():
     touch = touch_statistics(POLICY.model.tactile, [contacts()])
     params = initial()
@@ -100,6 +101,7 @@ def test_tokens_of_touch_count_alike_and_the_more_the_surer():
     np.testing.assert_allclose(both[:, width:], np.sqrt(view), rtol=1e-6)
 
 
+@pytest.mark.long
 def test_the_gradient_of_micro_batches_is_that_of_the_batch():
     touch = jax.device_put(touch_statistics(POLICY.model.tactile, [contacts()]))
     params = dict(initial())
@@ -136,6 +138,7 @@ def test_a_stem_that_reads_whole_frames_drops_no_patch():
         TactileViTConfig(sensors=2, stem="statistics", patches_kept=4)
 
 
+@pytest.mark.long
 def test_every_parameter_has_a_place_on_a_mesh():
     """Of what is trained and of its optimizer's state; the head once had a bias that no rule fitted."""
     batch = contacts(8)

@@ -53,6 +53,7 @@ def check(own, devices: SingleDevice) -> None:
     check_whole_batch(tiny.SHALLOW, tiny.shallow_params(0), own, CONFIG, Hooks(devices=devices), NOISE, 0)
 
 
+@pytest.mark.long
 def test_streams_are_checked_in_the_batch_of_all_processes_and_no_batch_is_used_up():
     """A process whose own rows have no touch would stop alone, and the others would wait for it for ever."""
     own, devices = Repeated(BLIND), ManyProcesses(WHOLE)

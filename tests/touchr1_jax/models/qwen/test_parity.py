@@ -47,6 +47,7 @@ def test_positions_are_those_of_the_reference(name, golden):
     np.testing.assert_array_equal(tiny.inputs_of(name).positions, golden[f"{name}.positions"])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", CASES)
 def test_logits_are_those_of_the_reference(name, golden, params):
     model = QwenVL(tiny.config_of(CASES[name]))
@@ -56,6 +57,7 @@ def test_logits_are_those_of_the_reference(name, golden, params):
     close(forward(params(CASES[name]), tiny.inputs_of(name)), theirs)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["mixed", "qwen3_mixed_1"])
 def test_cached_answers_are_the_full_forward_pass(name, golden, params):
     """The prompt without its last words, then these words at once, and one by one."""

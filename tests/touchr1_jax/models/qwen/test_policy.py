@@ -49,6 +49,7 @@ def completions(*shape: int) -> jax.Array:
     return jnp.asarray(np.random.default_rng(0).choice(WRITABLE, shape), jnp.int32)
 
 
+@pytest.mark.long
 def test_view_fills_its_tokens(batch):
     assert VIEW_TOKENS == LAYOUT.view.size == 4
     assert batch.features.view.shape == (P, VIEW_TOKENS, CONFIG.decoder.hidden_size)
@@ -70,6 +71,7 @@ def test_positions_are_those_of_the_model(batch):
     np.testing.assert_array_equal(ours[:, mask], position_ids(runs))
 
 
+@pytest.mark.long
 def test_untouched_policy_is_the_model(batch):
     """Without streams, the logits of a completion are those of `QwenVL` on the same conversation with a picture."""
     params, features = small_policy.params(), batch.features
@@ -127,6 +129,7 @@ def score(tokens: jax.Array, target: Target) -> tuple[jax.Array, dict[str, jax.A
     return right, {"right": right}, parsed
 
 
+@pytest.mark.long
 def test_one_grpo_step(batch):
     """With adapters on a frozen decoder: finite, on policy, at the reference, and every layer moves."""
     base = {"decoder": small_policy.params()["decoder"]}
@@ -159,6 +162,7 @@ def sft_batch() -> SFTBatch:
     )
 
 
+@pytest.mark.long
 def test_sft_with_adapters_and_a_whole_tactile_encoder():
     """What was pretrained stands still, an argument of the step; adapters and tactile encoder learn the answers."""
     params = small_policy.params()
@@ -197,6 +201,7 @@ def test_half_precision_decodes_as_the_learner_scores(batch):
     np.testing.assert_allclose(step[WRITABLE], scored[WRITABLE], atol=0.02 * float(jnp.abs(scored[WRITABLE]).max()))
 
 
+@pytest.mark.long
 def test_pretrained_towers_stand_beside_fresh_ones():
     params = small_policy.params()
     model = {"vision": params["vision"]["tower"], "decoder": params["decoder"]}

@@ -99,6 +99,7 @@ def batch():
     )
 
 
+@pytest.mark.long
 def test_steps_are_blocks_after_their_time(policy, batch):
     """The time and marks of a step without frames are absent, and both ways to tell which tokens exist agree."""
     fns, layout = policy.fns, policy.layout
@@ -133,6 +134,7 @@ def test_steps_are_blocks_after_their_time(policy, batch):
     np.testing.assert_array_equal(np.asarray(ours)[:, mask], position_ids([*runs, text]))
 
 
+@pytest.mark.long
 def test_packed_rows_are_the_prompts(policy, batch):
     """Levels reach the decoder both ways: hidden states of a prompt with a picture, and of a row that holds it."""
     fns, layout, params = policy.fns, policy.layout, policy.init(0, batch)

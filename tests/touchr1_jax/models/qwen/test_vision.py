@@ -42,12 +42,14 @@ def influence(params, grids, config) -> np.ndarray:
     return np.asarray(jnp.any(jacobian.reshape(jacobian.shape[0], -1, 4 * CONFIG.patch_size) != 0, -1))
 
 
+@pytest.mark.long
 def test_windows_see_themselves_alone(params):
     """Token columns 0–1 and 2–3 of both rows; gradients elsewhere are exactly 0."""
     window = np.array([0, 0, 1, 1] * 2)
     np.testing.assert_array_equal(influence(params, (GRID,), CONFIG), window[:, None] == window)
 
 
+@pytest.mark.long
 def test_full_layers_see_the_frame_and_no_other(params):
     """Two steps of a video and a picture behind it."""
     config = dataclasses.replace(CONFIG, full_layers=(1,))

@@ -70,6 +70,7 @@ def test_initial_parameters_have_the_abstract_shapes():
     assert jax.tree.map(shape, fresh) == jax.tree.map(shape, abstract_params(CONFIG))
 
 
+@pytest.mark.long
 def test_kernels_lie_with_inputs_first(expected, weights):
     """Published as [out, in], and the patch embedding as a convolution."""
     first, last = (expected["decoder"][name]["mlp"]["down"]["kernel"] for name in ("layers", "last_layer"))
