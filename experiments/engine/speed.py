@@ -22,6 +22,7 @@ from experiments.core.progress import ProgressCallback
 from experiments.core.timing import interleaved
 from experiments.engine.job import Job, config_of
 from experiments.engine.peers import EngineTimes, JobSize
+from experiments.engine.plain_program import PlainProgram
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.grpo import compiles_leanly
 from touchr1_jax.text.language import TOUCH_LANGUAGE
@@ -31,6 +32,7 @@ from touchr1_jax.text.tokenizer import word_level
 from touchr1_jax.training.compilation import compilations_kept, return_memory
 
 MATRIX = 1024  # side of the matrices whose product is the yardstick of a CPU
+PLAIN, REPEATED = "plain program", "repeated prefix"  # names in `others`
 SHORT = 1 / 8  # share of the words that end a completion where answers are to be short
 RESIDENT_EVERY = 100  # steps between two looks at the memory
 
@@ -168,25 +170,34 @@ def options(
     return {"this": change()} | {name: makers[name] for name in names if name in makers}
 
 
-def repeated(size: JobSize, prefix: int) -> dict[str, Callable[[], Job]]:
-    """Makers of the default engine and of one that encodes the prefix for every rollout."""
-    plain = config_of(size)
+def others(size: JobSize, prefix: int) -> dict[str, Callable[[], Job | PlainProgram]]:
+    """Makers of the default engine, of plain programs, and of an engine that encodes the prefix for every rollout."""
+    config = config_of(size)
     return {
-        "this": lambda: Job(size, prefix, plain),
-        "repeated prefix": lambda: Job(size, prefix, plain, repeated=True),
+        "this": lambda: Job(size, prefix, config),
+        PLAIN: lambda: PlainProgram(size, prefix, size.prompts),
+        f"{PLAIN}, micro-batches": lambda: PlainProgram(size, prefix, max(1, size.prompts // 4)),
+        REPEATED: lambda: Job(size, prefix, config, repeated=True),
     }
 
 
-def side_by_side(makers: dict[str, Callable[[], Job]], rounds: int, what: str, context: Context) -> dict[str, float]:
-    """Median over rounds of each job's time over that of `this` in the same round."""
+def side_by_side(
+    makers: Mapping[str, Callable[[], Job | PlainProgram]], rounds: int, what: str, context: Context
+) -> dict[str, np.ndarray]:
+    """Seconds of each job in every round, [rounds]."""
     calls = {}
     for name, make in context.each(f"compiling {what}", makers.items()):
         calls[name] = make().step
         _warm(calls[name])
     seconds = interleaved(calls, context.rounds(f"timing {what}", rounds))
-    ratios = {name: float(np.median(s / seconds["this"])) for name, s in seconds.items()}
-    context.print(f"{what}: {', '.join(f'{name} {ratio:.2f}' for name, ratio in ratios.items())}")
-    return ratios
+    shown = (f"{name} {ratio:.2f} ({np.median(seconds[name]):.3f} s)" for name, ratio in over_this(seconds).items())
+    context.print(f"{what}: {', '.join(shown)}")
+    return seconds
+
+
+def over_this(seconds: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Median of each job's time over that of `this`."""
+    return {name: float(np.median(s) / np.median(seconds["this"])) for name, s in seconds.items()}
 
 
 def parser_seconds(size: JobSize, rounds: int = 20) -> float:

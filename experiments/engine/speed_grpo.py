@@ -5,13 +5,14 @@
 
 One iteration of 8 prompts × 8 rollouts × 64 new tokens on a 1.05-million-parameter decoder with a reference policy, at
 prefixes of 64 to 1024 tokens, each in two processes of its own: one that compiles and one that reads the compiled
-programs.  It is compared with the engine's options, with an engine that encodes the prefix for every rollout, and with
-TRL and Tunix where they can be imported (see `harness_trl.py` and `harness_tunix.py`).  A large vocabulary and ten
+programs.  It is compared with the engine's options, with an engine that encodes the prefix for every rollout, with a
+plain program that shares the prefix (see `plain_program.py`), and with TRL and Tunix where they can be imported (see
+`harness_trl.py` and `harness_tunix.py`).  A large vocabulary and ten
 thousand steps, whose time and memory must stay constant, are measured too.  Matrix products are timed in the same
 process, so that shares of the peak need no data sheet.  Every shape of product of an iteration is also timed alone; on
 an idle machine, the sum estimates the lower bound of an iteration (see `matrix_floor.py`).
 
-Cost: about six minutes on two cores, as much again for the two other engines; `--scale smoke` under one.
+Cost: about seven minutes on two cores, as much again for the two other engines; `--scale smoke` under one.
 
 Expected: time grows with the prefix, which is encoded once, four to eight times more slowly than it would if every
 rollout encoded it; repeating the prefix takes longer in proportion to the group at long prefixes, as in the other
@@ -63,8 +64,8 @@ class SpeedConfig:
     options_at: int = 64
     """Prefix at which the options are timed."""
     repeated_at: tuple[int, ...] = (64, 512)
-    """Prefixes at which repeated prefixes and single products are timed, and lean compilation at the last; they must be
-    in `prefixes`."""
+    """Prefixes at which repeated prefixes, plain programs and single products are timed, and lean compilation at the
+    last; they must be in `prefixes`."""
     buckets: tuple[int, ...] = (16, 32, 48)
     """Lengths that updates from short answers may pay for."""
     words: int = 131_072
@@ -99,9 +100,9 @@ def run(config: SpeedConfig, context: Context) -> Results:
         lean = alone_in_processes("lean compilation", leanly)
         worded = alone_in_processes("many words", many_words(config) if config.words else {})
     makers = speed.options(size, config.options_at, config.buckets, config.options)
-    found = speed.side_by_side(makers, config.rounds, "options", context)
-    few = max(2, config.rounds // 2)
-    twice = {p: speed.side_by_side(speed.repeated(size, p), few, f"prefix {p}", context) for p in config.repeated_at}
+    alternating = lambda jobs, what: speed.side_by_side(jobs, config.rounds, what, context)
+    options = {config.options_at: alternating(makers, "options")}
+    others = {p: alternating(speed.others(size, p), f"prefix {p}") for p in config.repeated_at}
     floors = measure_floors(config, context)
     with context.progress_callback("steps", still=True) as progress:
         progress(0, config.steps)
@@ -111,18 +112,19 @@ def run(config: SpeedConfig, context: Context) -> Results:
     peers, failed = measure_peers(config, installed_peers(config.trl_python, config.tunix_python), context)
     compiled = {"as it is": first[lean_at]} | ({"lean": lean[lean_at]} if lean else {})
     return Results(
-        verdict=(*report.verdict(alone, twice, peers), *failed),
+        verdict=(*report.verdict(alone, others, peers), *failed),
         requirements=(
             *report.requirements(alone, first, lean, peers, long, speed.parser_seconds(size)),
             *report.peak_shares(size, alone, floors),
+            *report.plain_ratios(others, floors),
         ),
         pictures=report.pictures(size, alone, first, peers, long),
         tables=(
             report.alone_table(size, alone, first),
             *(floor_table(p, found, min(alone[p].seconds)) for p, found in floors.items()),
             *((report.peer_table(size, alone, first, peers),) if peers else ()),
-            report.compare_table("Options: time over that of the engine as it is", {config.options_at: found}),
-            report.compare_table("Repeating the prefix: time over that of the engine as it is", twice),
+            report.turns_table("Options, one at a time", options),
+            report.turns_table("Plain programs that share the prefix, and the engine with a repeated prefix", others),
             report.memory_table(f"Compiling at prefix {lean_at}", compiled),
             *((report.memory_table(f"A vocabulary of {config.words:,} words", worded),) if worded else ()),
         ),

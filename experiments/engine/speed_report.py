@@ -9,34 +9,36 @@ from experiments.core.charts import Panel, Rule, Series, draw
 from experiments.core.results import Cell, Picture, Requirement, Table, at_least, at_most, named_table
 from experiments.engine.matrix_floor import TimedProduct
 from experiments.engine.peers import JobSize, PeerTimes
-from experiments.engine.speed import RESIDENT_EVERY, LongRun, ProcessTiming
+from experiments.engine.speed import PLAIN, REPEATED, RESIDENT_EVERY, LongRun, ProcessTiming, over_this
 
 LIMITS_S = {64: 0.55, 512: 1.3}  # seconds an iteration may take at a prefix, on two cores of about 240 GFLOP/s
 
 PEER_S = {("TRL", 64): 1.36, ("Tunix", 64): 1.77, ("TRL", 512): 13.1, ("Tunix", 512): 24.5}
 """Seconds of the peers on the machine for which the limits were set; elsewhere the ratio counts."""
 
+PLAIN_RATIOS = {64: 1.47, 512: 2.15}  # least time of a plain program with a shared prefix over that of the engine
+
 MEMORY_LIMIT_GB, MEMORY_AT = 1.0, 512  # most memory of a process, up to this prefix
 PEAK_SHARE = 0.55  # least share of the speed of large products that an iteration should reach
 EARLY = 1000  # steps over which time must stay constant; memory must over all
 Timings = Mapping[int, ProcessTiming]  # prefix → timing
+Others = Mapping[int, Mapping[str, np.ndarray]]  # prefix → program → seconds of alternating rounds
 Peers = Mapping[tuple[str, int], PeerTimes]  # (Peer, prefix) → its times
 
 
-def verdict(alone: Timings, twice: Mapping[int, Mapping[str, float]], peers: Peers) -> tuple[str, ...]:
+def verdict(alone: Timings, others: Others, peers: Peers) -> tuple[str, ...]:
     """Time of an iteration, gain of prefixes that are encoded once, comparison with other engines."""
     times = ", ".join(f"{a.median_s:.3g} s at {prefix} tokens" for prefix, a in alone.items())
-    gains = ", ".join(f"{ratios['repeated prefix']:.1f} at {prefix}" for prefix, ratios in twice.items())
-    others = []
-    for name in dict.fromkeys(name for name, _ in peers):
-        ratios = {p: t.median_s / alone[p].median_s for (n, p), t in peers.items() if n == name}
-        others.append(
-            f"{name} takes longer by a factor of " + ", ".join(f"{r:.1f} at {p}" for p, r in ratios.items()) + "."
-        )
+    ratios: dict[str, dict[int, float]] = {
+        "A plain program that encodes it once": {p: over_this(s)[PLAIN] for p, s in others.items()},
+        "Encoding the prefix again for every rollout": {p: over_this(s)[REPEATED] for p, s in others.items()},
+    }
+    for (name, prefix), t in peers.items():
+        ratios.setdefault(name, {})[prefix] = t.median_s / alone[prefix].median_s
+    factors = {name: ", ".join(f"{r:.3g} at {prefix}" for prefix, r in by.items()) for name, by in ratios.items()}
     return (
         f"One iteration, by the length of the prefix: {times}.",
-        f"Encoding the prefix again for every rollout takes longer by a factor of {gains}.",
-        *others,
+        *(f"{name} takes longer by a factor of {factor}." for name, factor in factors.items()),
     )
 
 
@@ -94,6 +96,22 @@ def peak_shares(size: JobSize, alone: Timings, floors: Mapping[int, Sequence[Tim
         )
         for prefix, found in floors.items()
         if prefix in LIMITS_S
+    ]
+
+
+def plain_ratios(others: Others, floors: Mapping[int, Sequence[TimedProduct]]) -> list[Requirement]:
+    """Time of plain programs over this engine's, and over that of this engine's matrix products alone."""
+    note = "{:.2f} if nothing but this engine's matrix products, each timed alone, took time"
+    return [
+        at_least(
+            f"{name}'s time over this at prefix {prefix}",
+            ratio,
+            bound,
+            note=note.format(np.median(others[prefix][name]) / sum(t.seconds for t in floors[prefix])),
+        )
+        for prefix, bound in PLAIN_RATIOS.items()
+        for name, ratio in over_this(others.get(prefix, {})).items()
+        if name.startswith(PLAIN)
     ]
 
 
@@ -178,13 +196,16 @@ def peer_table(size: JobSize, alone: Timings, first: Timings, peers: Peers) -> T
     )
 
 
-def compare_table(title: str, found: Mapping[int, Mapping[str, float]]) -> Table:
-    """Time of every variant over that of the engine, in the same rounds."""
-    names = dict.fromkeys(name for ratios in found.values() for name in ratios)
-    rows = [{"variant": name, **{f"prefix {p}": ratios.get(name) for p, ratios in found.items()}} for name in names]
-    columns = [f"prefix {prefix}" for prefix in found]
-    meanings = dict.fromkeys(columns, "median ratio within rounds")
-    return named_table(title, rows, formats=dict.fromkeys(columns, ".2f"), meanings=meanings)
+def turns_table(title: str, others: Others) -> Table:
+    """Programs that took turns with the engine, compared with it."""
+    rows = [
+        {"program": name, "prefix": prefix, "an iteration": float(np.median(seconds[name])), "over this": ratio}
+        for prefix, seconds in others.items()
+        for name, ratio in over_this(seconds).items()
+    ]
+    units = {"prefix": "tokens", "an iteration": "s"}
+    meanings = {"an iteration": "median", "over this": "median over that of the engine as it is"}
+    return named_table(title, rows, formats={"over this": ".2f"}, units=units, meanings=meanings)
 
 
 def memory_table(title: str, found: Mapping[str, ProcessTiming]) -> Table:
