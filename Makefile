@@ -30,10 +30,10 @@ demo: setup  ## ask a trained policy in the browser: ARGS="POLICY", that of the 
 
 PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 
-test: setup  ## pass the tests (five minutes on two cores)
+test: setup  ## pass the tests (eight minutes on two cores)
 	$(PYTEST) -m 'not long and not slow' $(ARGS)
 
-test-long: setup  ## pass the tests that train or compile for seconds (ten minutes)
+test-long: setup  ## pass the tests that train or compile for seconds (as long again)
 	$(PYTEST) -m 'long and not slow' $(ARGS)
 
 test-slow: setup  ## pass the tests that take minutes
