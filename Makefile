@@ -5,6 +5,7 @@ EXP    ?= ablation_ordinal
 ARGS   ?=
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
+PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 
 PYTHONS ?= python3.11 python3.12
 
@@ -28,8 +29,6 @@ experiment: setup  ## run an experiment: EXP=name, ARGS="--scale smoke ..."
 demo: setup  ## ask a trained policy in the browser: ARGS="POLICY", that of the package by default
 	$(BIN)/python -m experiments demo $(ARGS)
 
-PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
-
 test: setup  ## pass the tests (eight minutes on two cores)
 	$(PYTEST) -m 'not long and not slow' $(ARGS)
 
@@ -41,7 +40,7 @@ test-slow: setup  ## pass the tests that take minutes
 
 test-matrix:  ## pass the tests on each of PYTHONS, in an environment of its own
 	@for python in $(PYTHONS); do $$python -c '' 2> /dev/null || { echo "$$python cannot be run: install it, or name others, as in make test-matrix PYTHONS=\"python3.11 python3.13\""; exit 1; }; done
-	for python in $(PYTHONS); do $(MAKE) test PYTHON=$$python VENV=.venv-$$python || exit 1; done
+	for python in $(PYTHONS); do $(MAKE) test test-long PYTHON=$$python VENV=.venv-$$python || exit 1; done
 
 lint: setup  ## check style, imports and types
 	$(BIN)/ruff check .

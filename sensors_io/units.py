@@ -149,17 +149,20 @@ _Engine = tuple[tuple[type[BaseException], ...], Callable[[Sequence[Any]], list[
 def _local(launcher: Launcher) -> _Engine:
     """A process for each of some threads, so that one that dies ends no other.
 
-    Each process has cores of its own: with threads for all cores, two on two cores take a third longer.
+    Each process has cores of its own, where the system lets it choose, so that its threads wait for no other's.
     """
-    threads, pools = concurrent.futures.ThreadPoolExecutor(launcher.workers), threading.local()
-    cores, numbers = sorted(getattr(os, "sched_getaffinity", lambda _: ())(0)), itertools.count()
+    pools, numbers = threading.local(), itertools.count()
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+
+    def choose_cores() -> None:
+        pools.cores = cores[next(numbers) % max(1, len(cores)) :: launcher.workers]
+
+    threads = concurrent.futures.ThreadPoolExecutor(launcher.workers, initializer=choose_cores)
     context = multiprocessing.get_context("spawn")
     made: list[concurrent.futures.ProcessPoolExecutor] = []
 
     def call(group: tuple[WorkUnit, ...]) -> dict[str, str]:
         if not hasattr(pools, "mine"):
-            if not hasattr(pools, "cores"):
-                pools.cores = cores[next(numbers) % max(1, len(cores)) :: launcher.workers]
             pools.mine = concurrent.futures.ProcessPoolExecutor(1, context, _begin, (pools.cores,))
             made.append(pools.mine)
         try:

@@ -26,6 +26,7 @@ from touchr1_jax.training.exploration import (
     RandomTouchFeed,
     WrittenTurns,
     demonstration,
+    observed,
     touch_batch_of,
     train_active,
 )
@@ -35,16 +36,6 @@ from touchr1_jax.training.train_sft import SFTConfig, train_sft
 from touchr1_jax.types import Params
 
 ROWS = 256  # trajectories that are scored at once
-
-
-def observed(
-    bank: TouchBank, objects: Int[np.ndarray, "*n"], choices: Int[np.ndarray, "*n B"]
-) -> tuple[Float[Array, "*n B N W"], Bool[Array, "*n B N"]]:
-    """Observations of these choices about objects, and where anything is observed."""
-    at = jnp.asarray(objects)[..., None], jnp.maximum(choices, 0)
-    exists = (jnp.asarray(choices) != NO_CHOICE) & bank.available[at]
-    tokens = jnp.where(exists[..., None, None], bank.tokens[at], 0.0)
-    return tokens, jnp.broadcast_to(exists[..., None], tokens.shape[:-1])
 
 
 def part_of(bank: TouchBank, objects: Int[np.ndarray, "n"]) -> TouchBank:
@@ -190,7 +181,7 @@ def _levels(
     tokens = written.trajectories(choices, zeros + question, zeros)
     word = np.argmax(written.answers[question, 0] != written.answers[question, 1])  # where answers differ
     at = (choices != NO_CHOICE).sum(1) * written.actions.shape[1] + word
-    touch, exists = observed(bank, objects, choices)
+    touch, exists = map(jnp.asarray, observed(bank, objects, choices))
     seen = Explored(jax.tree.map(lambda x: x[0], policy.prompt_features(1)), touch, exists, jnp.ones(1, bool))
     ids = written.answers[question, :, word]
     return np.asarray(

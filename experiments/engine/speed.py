@@ -196,8 +196,8 @@ def side_by_side(
 
 
 def over_this(seconds: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """Median of each job's time over that of `this`."""
-    return {name: float(np.median(s) / np.median(seconds["this"])) for name, s in seconds.items()}
+    """Median over rounds of each job's time over that of `this` in the same round."""
+    return {name: float(np.median(s / seconds["this"])) for name, s in seconds.items()}
 
 
 def parser_seconds(size: JobSize, rounds: int = 20) -> float:

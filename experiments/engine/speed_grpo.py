@@ -7,10 +7,10 @@ One iteration of 8 prompts × 8 rollouts × 64 new tokens on a 1.05-million-para
 prefixes of 64 to 1024 tokens, each in two processes of its own: one that compiles and one that reads the compiled
 programs.  It is compared with the engine's options, with an engine that encodes the prefix for every rollout, with a
 plain program that shares the prefix (see `plain_program.py`), and with TRL and Tunix where they can be imported (see
-`harness_trl.py` and `harness_tunix.py`).  A large vocabulary and ten
-thousand steps, whose time and memory must stay constant, are measured too.  Matrix products are timed in the same
-process, so that shares of the peak need no data sheet.  Every shape of product of an iteration is also timed alone; on
-an idle machine, the sum estimates the lower bound of an iteration (see `matrix_floor.py`).
+`harness_trl.py` and `harness_tunix.py`).  A large vocabulary and ten thousand steps, whose time and memory must stay
+constant, are measured too.  Matrix products are timed in the same process, so that shares of the peak need no data
+sheet.  Every shape of product of an iteration is also timed alone; on an idle machine, the sum estimates the lower
+bound of an iteration (see `matrix_floor.py`).
 
 Cost: about seven minutes on two cores, as much again for the two other engines; `--scale smoke` under one.
 

@@ -204,7 +204,7 @@ def turns_table(title: str, others: Others) -> Table:
         for name, ratio in over_this(seconds).items()
     ]
     units = {"prefix": "tokens", "an iteration": "s"}
-    meanings = {"an iteration": "median", "over this": "median over that of the engine as it is"}
+    meanings = {"an iteration": "median", "over this": "median ratio within rounds to the engine as it is"}
     return named_table(title, rows, formats={"over this": ".2f"}, units=units, meanings=meanings)
 
 

@@ -61,6 +61,22 @@ def folder(tmp_path):
     return tmp_path / "made"
 
 
+def write_cores(path: pathlib.Path) -> None:
+    """The cores of this worker."""
+    path.write_text(" ".join(map(str, os.sched_getaffinity(0))))
+
+
+@pytest.mark.skipif(len(getattr(os, "sched_getaffinity", lambda _: ())(0)) < 2, reason="one core, or no affinity here")
+def test_a_worker_process_keeps_to_a_part_of_the_cores(tmp_path):
+    paths = [tmp_path / str(i) for i in range(4)]
+    work = [WorkUnit(name=p.name, run=functools.partial(write_cores, p), done=p.exists) for p in paths]
+    assert len(list(finish(work, ENGINES["processes"]))) == 4
+    parts = {frozenset(map(int, p.read_text().split())) for p in paths}
+    every = os.sched_getaffinity(0)
+    assert all(part and part < every for part in parts)
+    assert sum(map(len, parts)) == len(frozenset().union(*parts))
+
+
 def test_every_unit_is_run_once_and_none_that_is_done(folder):
     (folder / "u2").write_text("made before")
     said = []

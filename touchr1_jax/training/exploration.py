@@ -14,7 +14,7 @@ import grain
 import jax
 import numpy as np
 import optax
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from touchr1_jax.models.active_policy import ActiveFns, ActivePolicy, Explored
 from touchr1_jax.rl.active import ActiveInputs, make_active_step
@@ -99,6 +99,21 @@ def touch_batch_of(
     return exploration_batch(policy, attribute, np.asarray(bank.label)[which], TouchCase(*case))
 
 
+def observed(
+    bank: TouchBank,
+    which: Int[np.ndarray, "n"],
+    choices: Int[np.ndarray, "n B"],
+    offered: Bool[np.ndarray, "n C"] | None = None,
+) -> tuple[Float[np.ndarray, "n B N W"], Bool[np.ndarray, "n B N"]]:
+    """Observations of these choices about objects, on the host, and where anything is observed."""
+    at = which[:, None], np.maximum(choices, 0)
+    exists = (choices != NO_CHOICE) & np.asarray(bank.available[at])
+    if offered is not None:
+        exists &= np.take_along_axis(offered, at[1], 1)
+    tokens = np.where(exists[..., None, None], np.asarray(bank.tokens[at]), 0).astype(np.float32)
+    return tokens, np.broadcast_to(exists[..., None], tokens.shape[:-1])
+
+
 def demonstration(
     policy: ActivePolicy,
     written: WrittenTurns,
@@ -117,17 +132,14 @@ def demonstration(
       choices: in order, `NO_CHOICE` from where a trajectory concludes.
       offered: choices that have not dropped out; by default all.  Of the others nothing is observed.
     """
-    n, rows, at = len(which), np.arange(len(which))[:, None], np.maximum(choices, 0)
-    observed = (choices != NO_CHOICE) & bank.available[which[:, None], at]
-    if offered is not None:
-        observed &= offered[rows, at]
-    touch = np.where(observed[..., None, None], bank.tokens[which[:, None], at], 0).astype(np.float32)
+    n = len(which)
+    touch, exists = observed(bank, which, choices, offered)
     tokens = written.trajectories(choices, attribute, np.asarray(bank.label)[which, attribute])
     seen: dict[str, Any] = {
         "prompt": policy.prompt_features(n),
         "touch": touch[:, None],
-        "exists": np.broadcast_to(observed[:, None, :, None], (n, 1, *touch.shape[1:3])),
-        "stream_mask": observed.any(1, keepdims=True),
+        "exists": exists[:, None],
+        "stream_mask": exists[..., 0].any(1, keepdims=True),
     }
     of: dict[str, Any] = {
         "touch": Explored(**seen),

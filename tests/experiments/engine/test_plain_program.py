@@ -6,6 +6,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from experiments.engine import speed_grpo
 from experiments.engine.job import Job, config_of, low_ids
@@ -24,6 +25,7 @@ def moved(params, seed):
     return jax.tree.map(lambda x: x + 0.1 * rng.normal(size=x.shape).astype(np.float32), params)
 
 
+@pytest.mark.long
 def test_loss_and_gradient_are_those_of_the_engine():
     """Of the same completions, under a policy that has left its reference; the plain ratios are to its own sampler."""
     config, job, prompts = config_of(SIZE), Job(SIZE, PREFIX, config_of(SIZE)), PlainProgram(SIZE, PREFIX, 1).prompts
@@ -50,6 +52,7 @@ def test_loss_and_gradient_are_those_of_the_engine():
     chex.assert_trees_all_close(grads, plain_params(wanted, SIZE), rtol=1e-5, atol=1e-5 * largest)
 
 
+@pytest.mark.long
 def test_an_iteration_moves_the_policy_and_not_its_reference():
     program = PlainProgram(SIZE, PREFIX, 1)
     before = jax.tree.map(np.array, program.params)
