@@ -223,6 +223,7 @@ SMOKE = ActiveTouchConfig(
         warm=SFTConfig(steps=20, batch_size=32, questions=1, micro_contacts=32),
         grpo=dataclasses.replace(LearnerConfig().grpo, prompts=10, group=4, micro_prompts=10),
         steps=4,
+        single_steps=4,
         kept=3,
         thresholds=(0.6,),
     ),

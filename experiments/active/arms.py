@@ -64,7 +64,8 @@ class LearnerConfig:
       warm: warm start on touches drawn at random.
       grpo: a step of reinforcement; its length follows from the budget.  By default it learns touches alone, from the
         probability of the right answer; a KL to the warm start keeps the answers, a light one touches apart.
-      steps: of reinforcement.
+      steps: of reinforcement with several contacts.
+      single_steps: of reinforcement with one contact, each of which costs a third as much.
       dropout: probability that a sensor or a motion drops out of a prompt.
       kept: choices of each question among which look-ups search for several contacts.
       thresholds: probabilities of the likeliest level at which the controls by threshold stop.
@@ -86,6 +87,7 @@ class LearnerConfig:
         algorithm=TOUCHES,
     )
     steps: int = 120
+    single_steps: int = 200
     dropout: float = 0.1
     kept: int = 12
     thresholds: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8, 0.9)
@@ -212,7 +214,7 @@ def reinforced_params(
         arm.budget,
         arm.prices,
         config.dropout,
-        config.steps,
+        config.single_steps if arm.budget == 1 else config.steps,
         context,
         f"grpo/{name}/{seed}",
         seed,

@@ -77,7 +77,8 @@ def findings(
             "choices": f"{len(setup.choices)}: {len(setup.sensors)} sensors, {len(setup.motions)} motions, "
             f"{len(setup.forces_n)} forces",
             "objects": ", ".join(f"{name} {len(rows)}" for name, rows in world.parts.items()),
-            "a step": f"{learner.grpo.prompts} prompts × {learner.grpo.group} trajectories, {learner.steps} steps",
+            "a step": f"{learner.grpo.prompts} prompts × {learner.grpo.group} trajectories",
+            "steps": f"{learner.single_steps} with one touch, {learner.steps} with several",
         },
         arms={name: row for name, row in estimates.items() if len(scores[name]) == len(seeds)},
         baselines={name: row for name, row in estimates.items() if len(scores[name]) < len(seeds)},
