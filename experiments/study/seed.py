@@ -273,17 +273,9 @@ class SeedTraining(StudySeed):
         names = (SFT, CONTINUED, *self.arms, BLIND, *self.variants)
         self.context.processes.write_once(lambda: self._drop_damaged(names))
         if not all(self._path(name).exists() for name in names):
-            params, contacts, validation = self._start()
-            test = self.encode(params, "test")
-            self._evaluate_all(SFT, params, test, contacts.noise)
-            others = (CONTINUED, *self.arms)
-            first = self.seed % len(others)  # seeds that are trained at the same time compile different programs
-            for name in others[first:] + others[:first]:
-                self._evaluate_all(name, self._continue(name, params, contacts, validation), test, contacts.noise)
-            if not self._path(BLIND).exists():
-                blind = self._train_blind()
-                unfelt = self.encode(blind, "test", blind=True)
-                self._evaluate(BLIND, lambda: self.ask(blind, unfelt, samples=self.config.samples))
+            order = (self._evaluate_arms, self._evaluate_blind)
+            for evaluate in order if self.seed % 2 == 0 else order[::-1]:  # see `_evaluate_arms`
+                evaluate()
         return {name: load_answers(self._path(name)) for name in names}
 
     def train(self, name: str) -> None:
@@ -308,6 +300,22 @@ class SeedTraining(StudySeed):
         if name != CONTINUED:
             return self.run_grpo(self.arms[name], f"grpo/{name}", contacts, params, self.rollouts)
         return self.continued(self.config.continued, contacts, validation, params)
+
+    def _evaluate_arms(self) -> None:
+        """SFT, its control and the arms; of seeds trained at the same time, one compiles what the other does not."""
+        params, contacts, validation = self._start()
+        test = self.encode(params, "test")
+        self._evaluate_all(SFT, params, test, contacts.noise)
+        others = (CONTINUED, *self.arms)
+        first = self.seed % 2 * (len(others) // 2)
+        for name in others[first:] + others[:first]:
+            self._evaluate_all(name, self._continue(name, params, contacts, validation), test, contacts.noise)
+
+    def _evaluate_blind(self) -> None:
+        if not self._path(BLIND).exists():
+            params = self._train_blind()
+            unseen = self.encode(params, "test", blind=True)
+            self._evaluate(BLIND, lambda: self.ask(params, unseen, samples=self.config.samples))
 
     def _train_blind(self) -> Params:
         return self.run_sft(self.config.blind, "blind", blind=True)

@@ -109,7 +109,7 @@ def save_policy(folder: Path, saved: SavedPolicy, *, precision: Precision = "flo
       card: the model card; by default a table of `notes`.
 
     Raises:
-      PolicyError: the folder exists and holds something else.
+      PolicyError: the folder exists and holds something else; a parameter is beyond the range of that precision.
     """
     if folder.exists() and format_of(folder) != FORMAT and (not folder.is_dir() or any(folder.iterdir())):
         raise PolicyError(f"folder is {folder}: it exists and is no policy; choose a new one")
@@ -301,8 +301,16 @@ def _stored(params: Params, precision: Precision) -> dict[str, np.ndarray]:
     """Tensors as they are written, by dotted names."""
     by_name = unstacked(traverse_util.flatten_dict(params, sep="."))
     flat = {name: np.asarray(x, np.float32) for name, x in by_name.items()}
-    if precision != "int8":
-        return {name: x.astype(precision) for name, x in flat.items()}
+    if precision == "float32":
+        return flat
+    most = np.finfo(np.float16 if precision == "float16" else np.float32).max
+    for name, x in flat.items():
+        if not (np.abs(x) <= most).all():
+            raise PolicyError(
+                f"{name} reaches {np.abs(x).max():g}: {precision} needs numbers up to {most:g}; save it in float32"
+            )
+    if precision == "float16":
+        return {name: x.astype(np.float16) for name, x in flat.items()}
     stored: dict[str, np.ndarray] = {}
     for name, x in flat.items():
         if x.ndim < 2:

@@ -60,6 +60,14 @@ def test_rounding_is_at_most_half_a_step_of_the_largest_weight(saved, tmp_path, 
     assert bound / 3 < error <= bound * 1.001
 
 
+@pytest.mark.parametrize(("precision", "value"), [("float16", 7e4), ("int8", np.nan)])
+def test_a_number_that_the_precision_lacks_is_named_and_nothing_is_written(saved, tmp_path, precision, value):
+    params = jax.tree.map(lambda x: np.full_like(x, value) if x.ndim > 1 else x, saved.params)
+    with pytest.raises(PolicyError, match=rf" reaches {value:g}: {precision} needs numbers up to"):
+        save_policy(tmp_path / "p", dataclasses.replace(saved, params=params), precision=precision)
+    assert not list(tmp_path.iterdir())
+
+
 def test_questions_and_words_are_those_of_training_whatever_the_code_asks_today(saved, tmp_path):
     words = [p.decode() for p in saved.policy.tokenizer.pieces if p]
     older = dataclasses.replace(saved.policy, tokenizer=word_tokenizer([*words[:5], *words[5:][::-1]]))
