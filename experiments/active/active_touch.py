@@ -23,6 +23,7 @@ policy with a price on harm avoids harm and answers worse.
 
 import dataclasses
 import functools
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,21 +31,26 @@ import numpy as np
 
 from experiments.active.agents import AGENT, AgentConfig, agent_played, agents_table, check_installed
 from experiments.active.arms import (
+    EQUAL,
     EVERY_TOUCH,
+    MISSING,
+    RULES,
     Arm,
     LearnerConfig,
     SeedPolicy,
-    at_seconds,
     beliefs_of,
     check_arms,
     controls,
     counted,
     every_touch,
     from_json,
+    looked_up,
     make_policy,
+    of_equal_seconds,
     one_step_look_ahead,
     reinforced,
     warm_start,
+    with_dropout,
 )
 from experiments.active.contacts import PROPERTIES, ContactsConfig
 from experiments.active.cost import cost_requirements, cost_table, step_cost
@@ -170,13 +176,27 @@ def _seed(
     if seed < config.full_seeds:
         compute = functools.partial(one_step_look_ahead, world, warm, learner, seed, context)
         found |= from_json(context.once(f"played/imitation/{seed}", compute))
-    several = counted("chosen", config.contacts)
-    for plan in ("random", "best_press", "best_fixed", "by_question"):
-        seconds = float(found[several].seconds.mean())
-        found[f"{plan}_at_equal_seconds"] = dataclasses.replace(
-            found[several], right=at_seconds(found, plan, seconds, config.contacts)
-        )
-    return found, warm, tables
+    found |= of_equal_seconds(found, found[counted("chosen", config.contacts)], config.contacts)
+    missing, headroom_missing = _missing(world, warm, found, config, seed)
+    return {**found, **missing}, warm, tables + headroom_missing
+
+
+def _missing(
+    world: TouchWorld, warm: SeedPolicy, found: Mapping[str, Played], config: ActiveTouchConfig, seed: int
+) -> tuple[dict[str, Played], list[Table]]:
+    """Plans by rule where choices drop out, looked up in beliefs where they drop out, and of the first the headroom."""
+    learner, contacts = config.learner, config.contacts
+    world = with_dropout(world, learner.dropout, seed)
+    warm = looked_up(world, warm.policy, warm.params, learner, contacts)
+    rules = controls(world, warm, learner, contacts, seed)
+    rules |= of_equal_seconds(rules, found[f"{counted('chosen', contacts)}_{MISSING}"], contacts)
+    tables = []
+    if seed == 0:
+        test = beliefs_of(world, warm.answer, "test")
+        left = headroom(warm.val, test, contacts, learner.kept)
+        tables.append(headroom_table(left, "the warm start, where choices drop out"))
+    compared = (*RULES, *(f"{rule}_{EQUAL}" for rule in RULES))
+    return {f"{rule}_{MISSING}": rules[rule] for rule in compared}, tables
 
 
 def _agents(

@@ -29,13 +29,21 @@ from touchr1_jax.models.active_policy import ActivePolicy, build_active_policy
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.rl.config import GRPOConfig, Norm, Paper
 from touchr1_jax.rl.touch_reward import Prices
-from touchr1_jax.training.exploration import NO_CHOICE, check_exploration, touch_batch_of
+from touchr1_jax.training.exploration import NO_CHOICE, check_exploration, drop_out, touch_batch_of
 from touchr1_jax.training.optimizer import OptimizerConfig
 from touchr1_jax.training.train_sft import SFTConfig
 from touchr1_jax.types import Params
 
 EVERY_TOUCH = "every_touch"  # the control that makes every contact; of the first seed alone
 
+RULES = ("random", "best_press", "best_fixed", "by_question")
+"""Plans by rule, with which policies are compared."""
+
+EQUAL = "at_equal_seconds"
+"""Ends the names of plans by rule that take as much time as the policy of several contacts."""
+
+MISSING = "missing"
+"""Ends the names of outcomes where sensors and motions drop out."""
 
 TOUCHES = Paper(beta=0.02, kl="exact", gamma=0.0, constrained=True, enumerated=Norm.STD, learn_conclusion=False)
 """Learns touches alone, from the probability of the right answer; the answers stay those of the warm start."""
@@ -66,7 +74,8 @@ class LearnerConfig:
         probability of the right answer; a KL to the warm start keeps the answers, a light one touches apart.
       steps: of reinforcement with several contacts.
       single_steps: of reinforcement with one contact, each of which costs a third as much.
-      dropout: probability that a sensor or a motion drops out of a prompt.
+      dropout: probability that a sensor or a motion drops out of a prompt with one contact, and of a test object.
+      several_dropout: the same of a prompt with several contacts, which teaches to touch again otherwise.
       kept: choices of each question among which look-ups search for several contacts.
       thresholds: probabilities of the likeliest level at which the controls by threshold stop.
     """
@@ -89,12 +98,14 @@ class LearnerConfig:
     steps: int = 120
     single_steps: int = 200
     dropout: float = 0.1
+    several_dropout: float = 0.4
     kept: int = 12
     thresholds: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8, 0.9)
 
     def __post_init__(self) -> None:
-        if not 0 <= self.dropout < 1:
-            raise ConfigurationError(f"dropout is {self.dropout}: must lie in 0 ≤ dropout < 1; lower it")
+        for name in ("dropout", "several_dropout"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ConfigurationError(f"{name} is {getattr(self, name)}: must lie in 0 ≤ {name} < 1; lower it")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -110,7 +121,7 @@ class SeedPolicy:
 
 def make_policy(world: TouchWorld, config: LearnerConfig) -> ActivePolicy:
     """The policy that speaks of the choices of a world."""
-    return build_active_policy(world.bank.actions, config.decoder)
+    return build_active_policy(world.bank.actions, config.decoder, repeats=False)
 
 
 def check_arms(world: TouchWorld, policy: ActivePolicy, arms: Mapping[str, Arm]) -> None:
@@ -126,12 +137,23 @@ def warm_start(
     world: TouchWorld, policy: ActivePolicy, config: LearnerConfig, contacts: int, seed: int, context: Context
 ) -> SeedPolicy:
     """SFT on touches drawn at random, and look-ups in what the policy then believes about validation objects."""
-    bank = world.bank
-    params = warm_params(world, policy, config, contacts, seed, context)
-    answer = answerer(policy, params, bank)
+    return looked_up(world, policy, warm_params(world, policy, config, contacts, seed, context), config, contacts)
+
+
+def looked_up(
+    world: TouchWorld, policy: ActivePolicy, params: Params, config: LearnerConfig, contacts: int
+) -> SeedPolicy:
+    """Look-ups in what a policy believes about the validation objects of a world."""
+    answer = answerer(policy, params, world.bank)
     val = beliefs_of(world, answer, "val")
-    look = look_up(bank, val, contacts, config.kept)
+    look = look_up(world.bank, val, contacts, config.kept)
     return SeedPolicy(policy=policy, params=params, answer=answer, val=val, look=look)
+
+
+def with_dropout(world: TouchWorld, share: float, seed: int) -> TouchWorld:
+    """The same contacts without those of the sensors and motions that drop out of each object with this probability."""
+    stays = drop_out(world.bank, len(world.bank.label), share, np.random.default_rng(seed))
+    return dataclasses.replace(world, bank=dataclasses.replace(world.bank, available=world.bank.available & stays))
 
 
 def warm_params(
@@ -183,7 +205,11 @@ def every_touch(world: TouchWorld, beliefs: Beliefs) -> Played:
 def reinforced(
     world: TouchWorld, warm: SeedPolicy, config: LearnerConfig, name: str, arm: Arm, seed: int, context: Context
 ) -> dict[str, Any]:
-    """Outcomes of a reinforced policy on test objects, and of its contacts answered by the warm start, as JSON."""
+    """Outcomes of a reinforced policy on test objects, as JSON.
+
+    Also those of its contacts answered by the warm start, of contacts that it chooses without observing any, and where
+    sensors and motions drop out.
+    """
     params = reinforced_params(world, warm.policy, warm.params, config, name, arm, seed, context)
     context.processes.write_once(lambda: publish(world, warm.policy, params, arm.budget, name, seed, context.directory))
     objects = world.parts["test"]
@@ -192,7 +218,15 @@ def reinforced(
     unseen = dataclasses.replace(world.bank, available=jnp.zeros_like(world.bank.available))
     unseeing = explore(warm.policy, params, unseen, objects, arm.budget)
     chosen_unseen = play(world.bank, objects, unseeing.choices, answerer(warm.policy, params, world.bank))
-    return as_json({name: found, f"{name}_warm_answers": own_answers, f"{name}_unseen": chosen_unseen})
+    lacking = explore(warm.policy, params, with_dropout(world, config.dropout, seed).bank, objects, arm.budget)
+    return as_json(
+        {
+            name: found,
+            f"{name}_warm_answers": own_answers,
+            f"{name}_unseen": chosen_unseen,
+            f"{name}_{MISSING}": lacking,
+        }
+    )
 
 
 def reinforced_params(
@@ -206,6 +240,7 @@ def reinforced_params(
     context: Context,
 ) -> Params:
     """GRPO on the objects of that part, from the parameters of a warm start."""
+    one = arm.budget == 1
     return reinforce(
         policy,
         params,
@@ -213,8 +248,8 @@ def reinforced_params(
         config.grpo,
         arm.budget,
         arm.prices,
-        config.dropout,
-        config.single_steps if arm.budget == 1 else config.steps,
+        config.dropout if one else config.several_dropout,
+        config.single_steps if one else config.steps,
         context,
         f"grpo/{name}/{seed}",
         seed,
@@ -230,6 +265,15 @@ def one_step_look_ahead(
     learned, best = part_of(world.bank, world.parts["reinforced"]), true.argmax(1).astype(np.int32)
     params = imitate(warm.policy, warm.params, learned, best, config.warm, context, f"imitation/{seed}", seed)
     return as_json({"imitation": explore(warm.policy, params, world.bank, world.parts["test"], 1)})
+
+
+def of_equal_seconds(found: Mapping[str, Played], policy: Played, contacts: int) -> dict[str, Played]:
+    """Plans by rule in the mean time of a policy."""
+    seconds = float(policy.seconds.mean())
+    return {
+        f"{plan}_{EQUAL}": dataclasses.replace(policy, right=at_seconds(found, plan, seconds, contacts))
+        for plan in RULES
+    }
 
 
 def at_seconds(found: Mapping[str, Played], plan: str, seconds: float, contacts: int) -> Float[np.ndarray, "n A"]:

@@ -7,7 +7,7 @@ import numpy as np
 
 from experiments.active import report
 from experiments.active.agents import AGENT
-from experiments.active.arms import EVERY_TOUCH, Arm, LearnerConfig, counted
+from experiments.active.arms import EQUAL, EVERY_TOUCH, MISSING, RULES, Arm, LearnerConfig, counted
 from experiments.active.contacts import PROPERTIES
 from experiments.active.headroom import BY_BELIEF, BY_QUESTION, Beliefs, headroom
 from experiments.active.plans import Played
@@ -30,8 +30,6 @@ from touchr1_jax.training.exploration import NO_CHOICE
 
 METRIC = "acc"  # mean of the accuracy over the five properties
 
-RULES = ("random", "best_press", "best_fixed", "by_question")
-EQUAL = "at_equal_seconds"
 Seeds = Sequence[Mapping[str, Played]]
 
 
@@ -57,7 +55,7 @@ def findings(
         requirements=requirements(world, comparisons, seeds, contacts),
         tables=(
             *tables,
-            plan_table(seeds, estimates),
+            *plan_tables(seeds, estimates, learner),
             report.procedures_table(setup, chosen, test),
             report.probe_table(
                 setup, test, "One contact, by probes", "Right answers of linear probes about test objects, %."
@@ -104,6 +102,8 @@ def compared(
     pairs = [("chosen", rule) for rule in (*RULES, "chosen_warm_answers")]
     pairs += [("chosen_warm_answers", rule) for rule in RULES]
     pairs += [(several, f"{rule}_{EQUAL}") for rule in RULES]
+    pairs += [(f"chosen_{MISSING}", f"{rule}_{MISSING}") for rule in RULES]
+    pairs += [(f"{several}_{MISSING}", f"{rule}_{EQUAL}_{MISSING}") for rule in RULES]
     pairs += [(several, f"{several}_unseen"), (several, "chosen"), ("by_question", "no_touch")]
     found = []
     for a, b in pairs:
@@ -125,6 +125,8 @@ def requirements(
     several = counted("chosen", contacts)
     fixed, question = named(comparisons, "chosen", "best_fixed"), named(comparisons, "chosen", "by_question")
     later = named(comparisons, several, f"by_question_{EQUAL}")
+    dropped = named(comparisons, f"chosen_{MISSING}", f"by_question_{MISSING}")
+    later_dropped = named(comparisons, f"{several}_{MISSING}", f"by_question_{EQUAL}_{MISSING}")
     every = seeds[0][EVERY_TOUCH]
     seconds = np.mean([f[several].seconds.mean() for f in seeds])
     note = f"95 % interval over objects {bounds(fixed.low, fixed.high)}"
@@ -136,6 +138,8 @@ def requirements(
         at_least("lower end of its interval", fixed.low, 0.0, "points"),
         at_least("upper end of chosen over best by question", question.high, 0.0, "points"),
         at_least(f"the same with up to {contacts} contacts, equal seconds", later.high, 0.0, "points"),
+        at_least("upper end, one contact, where choices drop out", dropped.high, 0.0, "points"),
+        at_least(f"upper end, up to {contacts}, where choices drop out", later_dropped.high, 0.0, "points"),
         at_least(f"up to {contacts} contacts over every contact", 100 * accuracy, 0.0, "points"),
         at_most("seconds of touch, share of every contact's", 100 * seconds / every.seconds.mean(), 15.0, "%"),
         at_least(
@@ -176,12 +180,34 @@ def verdict(
     )
 
 
-def plan_table(seeds: Seeds, estimates: Mapping[str, Mapping[str, Estimate]]) -> Table:
-    """Accuracy, seconds and harm of everything that was played."""
+def plan_tables(
+    seeds: Seeds, estimates: Mapping[str, Mapping[str, Estimate]], learner: LearnerConfig
+) -> tuple[Table, Table]:
+    """All outcomes, and those where choices drop out."""
+    note = (
+        "Plans by rule are answered by the warm start; `_warm_answers` are the touches of a reinforced policy, answered "
+        "by the warm start; of `_unseen` the touches were chosen without seeing any observation."
+    )
+    note_missing = (
+        f"Each sensor and each motion drops out of an object with probability {learner.dropout:g}, unknown to plan and "
+        "policy: a contact without them takes its time and returns nothing. Plans by rule were looked up where choices "
+        f"drop out; those of `_{EQUAL}` take the time of the policy of several contacts."
+    )
+    usual = [name for name in estimates if not name.endswith((EQUAL, MISSING))]
+    missing = [name for name in estimates if name.endswith(MISSING)]
+    return (
+        plan_table("Plans and policies", usual, note, seeds, estimates),
+        plan_table("Where choices drop out", missing, note_missing, seeds, estimates),
+    )
+
+
+def plan_table(
+    title: str, names: Sequence[str], note: str, seeds: Seeds, estimates: Mapping[str, Mapping[str, Estimate]]
+) -> Table:
+    """Accuracy, seconds and harm of these outcomes."""
     rows: list[dict[str, Any]] = []
-    for name, one in estimates.items():
-        if name.endswith(EQUAL):
-            continue
+    for name in names:
+        one = estimates[name]
         mean = lambda field, name=name: float(np.mean([getattr(f[name], field).mean() for f in seeds if name in f]))
         by = np.mean([f[name].right.mean(0) for f in seeds if name in f], 0)
         rows.append(
@@ -198,14 +224,12 @@ def plan_table(seeds: Seeds, estimates: Mapping[str, Mapping[str, Estimate]]) ->
         )
     percent = ("right", "from", "to", *PROPERTIES)
     return named_table(
-        "Plans and policies",
+        title,
         rows,
         formats=dict.fromkeys(percent, ".1f") | {"contacts": ".2f", "seconds": ".1f", "past the limit": ".3f"},
         units=dict.fromkeys(percent, "%") | {"seconds": "s"},
         meanings={"past the limit": "contacts of a question that strain gel or object past the limit"},
-        note="Test objects, mean over seeds, intervals over objects. Plans by rule are answered by the warm start; "
-        "`_warm_answers` are the touches of a reinforced policy, answered by the warm start; of `_unseen` the touches "
-        "were chosen without seeing any observation.",
+        note=f"Test objects, mean over seeds, intervals over objects. {note}",
     )
 
 

@@ -30,7 +30,10 @@ class Played:
 
 
 def play(bank: TouchBank, objects: Int[np.ndarray, "n"], choices: Int[np.ndarray, "n A k"], answer: Answer) -> Played:
-    """Make the chosen contacts with objects of a bank and answer; the same for every plan."""
+    """Make the chosen contacts with objects of a bank and answer; the same for every plan.
+
+    A contact that is not available takes its time and does no harm.
+    """
     n, questions, count = choices.shape
     flat = choices.reshape(n * questions, count)
     rows, asked = np.repeat(objects, questions), np.tile(np.arange(questions), n)
@@ -41,7 +44,8 @@ def play(bank: TouchBank, objects: Int[np.ndarray, "n"], choices: Int[np.ndarray
         (np.asarray(x, np.float64)[rows[:, None], np.maximum(flat, 0)] * made).sum(-1).reshape(n, questions)
     )
     right = (level == label).astype(float).reshape(n, questions)
-    return Played(right=right, seconds=total(bank.seconds), harm=total(bank.harm), choices=choices)
+    harm = total(np.where(bank.available, bank.harm, 0))
+    return Played(right=right, seconds=total(bank.seconds), harm=harm, choices=choices)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -186,6 +186,7 @@ def read_explorer(folder: Path) -> Explorer:
         policy = build_active_policy(
             tuple(choice.words for choice in touch_choices(contacts)),
             dataclasses.replace(DecoderConfig(**_tuples(found["decoder"])), vocab_size=0),
+            repeats=False,
         )
         arrays = {name: read_tensor(entry) for name, entry in read_header(folder / SINGLE).items()}
         named = {name.replace("/", "."): x for name, x in arrays.items() if name.startswith("policy/")}

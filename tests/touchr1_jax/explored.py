@@ -28,15 +28,16 @@ DECODER = DecoderConfig(
     intermediate_size=32,
     mrope_section=(2, 3, 3),
 )
-POLICY, SHALLOW = (
+POLICY, SHALLOW, ONCE = (
     build_active_policy(
         tuple(choice.words for choice in CHOICES),
         dataclasses.replace(DECODER, num_layers=layers),
         attributes=(HARDNESS, FRICTION),
+        repeats=repeats,
     )
-    for layers in (2, 1)
+    for layers, repeats in ((2, True), (1, True), (2, False))
 )
-"""The policy, and one with a single decoder layer for programs that are slow to compile."""
+"""The policy, one with a single decoder layer for programs that are slow to compile, one that repeats no action."""
 
 T = POLICY.tokens(BUDGET)
 

@@ -43,10 +43,11 @@ class Explored:
 
 
 class Placed(NamedTuple):
-    """Hidden states, and the place in a turn from which each predicts a token."""
+    """Hidden states, the place in a turn from which each predicts a token, and the actions before that turn."""
 
     hidden: Float[Array, "*n D"]
     place: Int[Array, "*n"]
+    made: Int[Array, "*n B"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -95,9 +96,9 @@ class ActiveFns(PolicyFns):
         """Append embedded tokens to a trajectory; see `Decoder.advance`."""
         return self._apply(params, Policy.advance, x, exists, t, prefix, caches, seen)
 
-    def placed(self, hidden: Float[Array, "*n D"], place: Int[Array, "*n"]) -> Any:
+    def placed(self, hidden: Float[Array, "*n D"], place: Int[Array, "*n"], made: Int[Array, "*n B"]) -> Any:
         """States as `logits` takes them."""
-        return Placed(hidden, place) if self.constrained else hidden
+        return Placed(hidden, place, made) if self.constrained else hidden
 
     def group_states(
         self,
@@ -124,19 +125,25 @@ class ActiveFns(PolicyFns):
             )
 
         hidden = jax.vmap(of_one)(tokens, features.touch, features.exists)
-        return (self.placed(hidden, jax.vmap(self.places)(tokens)) if self.constrained else hidden), prefix
+        return (self.placed(hidden, *jax.vmap(self.places)(tokens)) if self.constrained else hidden), prefix
 
-    def places(self, tokens: Int[Array, "T"]) -> Int[Array, "T"]:
-        """The place in its turn from which each token of a trajectory is predicted; the last turn must conclude."""
+    def places(self, tokens: Int[Array, "T"]) -> tuple[Int[Array, "T"], Int[Array, "T B"]]:
+        """The place in its turn from which each token of a trajectory is predicted, and the actions before that turn.
+
+        The last turn must conclude.
+        """
         by_turn = tokens.reshape(-1, self.turns.length)
-        last = jnp.arange(len(by_turn)) == len(by_turn) - 1
-        return self.turns.places(by_turn, last)[0].reshape(-1)
+        turn = jnp.arange(len(by_turn))
+        before, after = self.turns.places(by_turn, turn == len(by_turn) - 1)
+        action = jnp.asarray(self.turns.action)[after[:-1]]
+        made = jnp.where(turn[:-1] < turn[:, None], action, -1)
+        return before.reshape(-1), jnp.repeat(made, self.turns.length, 0)
 
     def logits(self, params: Params, states: Any) -> Float[Array, "*n V"]:
         """Scores of the next token; of constrained states those that continue no turn are out of reach."""
         if not isinstance(states, Placed):
             return super().logits(params, states)
-        return jnp.where(self.turns.allowed(states.place), super().logits(params, states.hidden), MASKED)
+        return jnp.where(self.turns.allowed(states.place, states.made), super().logits(params, states.hidden), MASKED)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -215,7 +222,11 @@ def _initializer(policy: ActivePolicy, width: int) -> Any:
 
 
 def build_active_policy(
-    actions: tuple[str, ...], decoder: DecoderConfig, *, attributes: tuple[Attribute, ...] = EXPLORED_ATTRIBUTES
+    actions: tuple[str, ...],
+    decoder: DecoderConfig,
+    *,
+    attributes: tuple[Attribute, ...] = EXPLORED_ATTRIBUTES,
+    repeats: bool = True,
 ) -> ActivePolicy:
     """Put language, tokenizer, prompts and Linen module together for the actions of an environment.
 
@@ -223,11 +234,12 @@ def build_active_policy(
       actions: the words of each (`Environment.actions`).
       decoder: sizes; the vocabulary comes from the language.
       attributes: those that are asked for; each needs a question in `QUESTIONS_OF_TOUCH`.
+      repeats: whether a trajectory may contain an action twice; leave it out where a second one returns the same.
 
     Raises:
       ValueError: an attribute without a question, or as `compile_turns`.
     """
-    language = TurnLanguage(actions=actions, attributes=attributes)
+    language = TurnLanguage(actions=actions, attributes=attributes, repeats=repeats)
     tokenizer = turn_tokenizer(language)
     missing = [a.name for a in attributes if a.name not in QUESTIONS_OF_TOUCH]
     if missing:

@@ -47,9 +47,10 @@ class Trajectories:
 
 
 class _Walk(NamedTuple):
-    """Where all trajectories are before a turn; `hidden` predicts their next token."""
+    """Where all trajectories are before a turn; `hidden` predicts their next token, `made` are the actions so far."""
 
     state: Any
+    made: Int[Array, "P G B"]
     alive: Bool[Array, "P G"]
     hidden: Float[Array, "P G D"]
     caches: CompletionCaches
@@ -108,6 +109,7 @@ def sample_trajectories(
     rows = (budget + 1) * (fns.turns.length + sampler.observed)
     start = _Walk(
         state=state,
+        made=jnp.full((p, g, budget), -1, jnp.int32),
         alive=jnp.ones((p, g), bool),
         hidden=spread(first),
         caches=jax.tree.map(lambda c: jnp.broadcast_to(c, (p, g, *c.shape)), fns.empty_cache(rows)),
@@ -174,7 +176,8 @@ class _Sampler:
         where_acts = lambda new, old: jnp.where(acts.reshape(acts.shape + (1,) * (new.ndim - 2)), new, old)
         exists = outcome.exists & acts[..., None]
         after = self.observe(turn.walk, outcome.tokens, exists, row + turns.length)
-        after = after._replace(state=jax.tree.map(where_acts, state, walk.state), alive=acts)
+        made = jnp.where(jnp.arange(self.budget) == i, action[..., None], walk.made)
+        after = after._replace(state=jax.tree.map(where_acts, state, walk.state), made=made, alive=acts)
         none = lambda x: jnp.where(acts, x, 0.0)
         return after, _Done(
             tokens=turn.tokens,
@@ -197,7 +200,7 @@ class _Sampler:
 
         def add_token(turn: _Turn) -> _Turn:
             here, goes = turn.walk, talks(turn)
-            states = self.fns.placed(here.hidden, turn.place)
+            states = self.fns.placed(here.hidden, turn.place, here.made)
             logits = tempered(self.fns.logits(self.params, states), self.draw.temperature)
             token = draw_token(logits, jax.random.fold_in(key, turn.t), self.draw)
             log_prob = drawn_log_probs(jax.nn.log_softmax(logits), token, self.draw.top_p, self.draw.min_p)

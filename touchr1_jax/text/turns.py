@@ -34,10 +34,14 @@ QUESTIONS_OF_TOUCH: Mapping[str, str] = {
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TurnLanguage:
-    """Actions and answers that turns can name; `tags` enclose an action and the conclusion."""
+    """Actions and answers that turns can name; `tags` enclose an action and the conclusion.
+
+    Without `repeats` a constrained policy takes each action at most once in a trajectory.
+    """
 
     actions: tuple[str, ...]
     attributes: tuple[Attribute, ...] = EXPLORED_ATTRIBUTES
+    repeats: bool = True
     tags: tuple[str, str] = ("touch", "conclude")
 
     def action_text(self, action: int) -> str:
@@ -63,7 +67,8 @@ class Turns:
     """The turns of a language for a tokenizer, as tables; a place is a prefix of legal turns, c a class of tokens.
 
     `action[place]` is the action that is named completely there and `answer[place, a]` the level of attribute a, both
-    −1 elsewhere.  `LEFT` stays `LEFT`.
+    −1 elsewhere.  `LEFT` stays `LEFT`.  `names[place, i]` is true where a turn through that place can name action i, in
+    the last column where it can conclude; it is `None` where actions may be repeated.
     """
 
     token_class: np.ndarray  # int32 [V]; class 0 are the tokens of no turn
@@ -72,10 +77,22 @@ class Turns:
     answer: np.ndarray  # int32 [places, A]
     length: int
     """Tokens of the longest turn."""
+    names: np.ndarray | None = None  # bool [places, C + 1]
 
-    def allowed(self, place: Int[Array, "*n"]) -> Bool[Array, "*n V"]:
-        """Mask of the tokens that continue a turn."""
-        return jnp.asarray(self.successor)[place][..., self.token_class] != LEFT
+    def allowed(self, place: Int[Array, "*n"], made: Int[Array, "*n B"]) -> Bool[Array, "*n V"]:
+        """Mask of the tokens that continue a turn.
+
+        Args:
+          place: where the turn is.
+          made: actions of the turns before it, −1 for none; a turn that must not repeat them cannot name them.
+        """
+        after = jnp.asarray(self.successor)[place]
+        continues = after != LEFT
+        if self.names is not None:
+            new = ~jnp.any(made[..., None] == jnp.arange(self.names.shape[1]), -2)
+            can_end = jnp.einsum("...i,ki->...k", new.astype(jnp.float32), jnp.asarray(self.names, jnp.float32)) > 0
+            continues &= jnp.take_along_axis(can_end, after, -1)
+        return continues[..., self.token_class]
 
     def advance(self, place: Int[Array, "*n"], token: Int[Array, "*n"]) -> Int[Array, "*n"]:
         """The place after a token."""
@@ -118,8 +135,9 @@ def compile_turns(language: TurnLanguage, tokenizer: Tokenizer) -> Turns:
     token_class = np.zeros(tokenizer.vocab_size, np.int32)
     token_class[known] = 1 + np.arange(len(known))
     rows: list[dict[int, int]] = [{}, {}, {}]
-    ends_with = [_insert(rows, ANY_TURN, turn) for turn in acts + answers]
-    concludes_with = [_insert(rows, LAST_TURN, turn) for turn in answers]
+    paths = [_insert(rows, ANY_TURN, turn) for turn in acts + answers]
+    last_paths = [_insert(rows, LAST_TURN, turn) for turn in answers]
+    ends_with, concludes_with = ([path[-1] for path in of_root] for of_root in (paths, last_paths))
     meanings = [-1] * len(rows)
     levels = np.full((len(rows), len(language.attributes)), -1, np.int32)
     for action in range(len(acts)):
@@ -134,9 +152,16 @@ def compile_turns(language: TurnLanguage, tokenizer: Tokenizer) -> Turns:
     for place, row in enumerate(rows):
         for token, after in row.items():
             successor[place, token_class[token]] = after
-    longest = max(map(len, acts + answers))
+    names = np.zeros((len(rows), len(acts) + 1), bool)
+    for i, path in enumerate(paths + last_paths):
+        names[path, min(i, len(acts))] = True
     return Turns(
-        token_class=token_class, successor=successor, action=np.array(meanings, np.int32), answer=levels, length=longest
+        token_class=token_class,
+        successor=successor,
+        action=np.array(meanings, np.int32),
+        answer=levels,
+        length=max(map(len, acts + answers)),
+        names=None if language.repeats else names,
     )
 
 
@@ -146,15 +171,15 @@ def turn_tokenizer(language: TurnLanguage) -> Tokenizer:
     return word_tokenizer([*turns, *map(language.answer_text, language.words), *QUESTIONS_OF_TOUCH.values()])
 
 
-def _insert(rows: list[dict[int, int]], root: int, turn: list[int]) -> int:
-    """Add the tokens of a turn below a root; the place of its last token."""
-    place = root
+def _insert(rows: list[dict[int, int]], root: int, turn: list[int]) -> list[int]:
+    """Add the tokens of a turn below a root; the places after each of them."""
+    path = [root]
     for token in turn:
-        if token not in rows[place]:
-            rows[place][token] = len(rows)
+        if token not in rows[path[-1]]:
+            rows[path[-1]][token] = len(rows)
             rows.append({})
-        place = rows[place][token]
-    return place
+        path.append(rows[path[-1]][token])
+    return path[1:]
 
 
 def _level(attribute: Attribute, word: str) -> int:

@@ -24,7 +24,7 @@ def frames(seed: int) -> np.ndarray:
 
 def explorer(seed: int, budget: int = 2) -> Explorer:
     """An explorer whose parameters are drawn."""
-    policy = build_active_policy(tuple(c.words for c in touch_choices(CONTACTS)), DECODER)
+    policy = build_active_policy(tuple(c.words for c in touch_choices(CONTACTS)), DECODER, repeats=False)
     params = draw_params(jax.eval_shape(lambda: policy.init(0, WIDTH)), seed, loud=0.3)
     encoder = ContactEncoderConfig(width=8, layers=1)
     statistics = np.stack([np.asarray(patch_statistics(frames(i)[None]))[0] for i in range(6)])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.touchr1_jax import explored
-from tests.touchr1_jax.explored import BANK, BUDGET, POLICY, N
+from tests.touchr1_jax.explored import BANK, BUDGET, ONCE, POLICY, N
 from touchr1_jax.models.active_policy import Explored
 from touchr1_jax.rl.active import make_explore
 from touchr1_jax.rl.config import DrGrpo, GRPOConfig
@@ -23,10 +23,13 @@ def explore(fns, batch, seed: int = 0, **options):
     return run(explored.params(), jax.tree.map(jnp.asarray, BANK), batch, jax.random.key(seed))
 
 
-@pytest.fixture(scope="module", params=[True, False], ids=["constrained", "free"])
+FNS = {"constrained": POLICY.constrained_fns, "free": POLICY.fns, "once": ONCE.constrained_fns}
+
+
+@pytest.fixture(scope="module", params=FNS)
 def found(request):
     """Functions, batch and trajectories."""
-    fns, batch = POLICY.constrained_fns if request.param else POLICY.fns, explored.batch_of(*OBJECTS)
+    fns, batch = FNS[request.param], explored.batch_of(*OBJECTS)
     return fns, batch, explore(fns, batch)
 
 
@@ -44,6 +47,14 @@ def test_sampler_and_learner_agree(found):
     again = jax.jit(lambda p: log_probs(fns, config, p, shown, said.rollout))(explored.params())
     assert said.rollout.mask.sum() > 4 * GROUP
     np.testing.assert_allclose(np.where(said.rollout.mask, again, 0), said.rollout.log_prob, atol=1e-5)
+
+
+@pytest.mark.long
+def test_a_policy_that_repeats_no_action_takes_each_once():
+    two = {
+        tuple(a) for a in explore(ONCE.constrained_fns, explored.batch_of(*OBJECTS)).action.reshape(-1, BUDGET).tolist()
+    }
+    assert two == {(-1, -1), (0, -1), (1, -1), (0, 1), (1, 0)}
 
 
 def test_actions_tokens_costs_and_answers_tell_one_story(legal):

@@ -1,5 +1,7 @@
 """Turns are read from tokens, and the automaton allows exactly what continues one."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -55,11 +57,15 @@ def test_the_last_turn_must_conclude():
     assert read("<touch> xense slide 2n </touch>", last=True) == (-1, NO_LEVEL)
 
 
-def words_after(text: str, place: int = ANY_TURN) -> set[str]:
-    """Tokens that the automaton allows after a text."""
+ONCE = compile_turns(dataclasses.replace(LANGUAGE, repeats=False), TOKENIZER)
+
+
+def words_after(text: str, place: int = ANY_TURN, turns=TURNS, made=()) -> set[str]:
+    """Tokens that the automaton allows after a text, and after these actions."""
+    before = jnp.array([*made, -1])
     for token in TOKENIZER.encode(text):
         place = int(TURNS.advance(jnp.array(place), jnp.array(token)))
-    return {TOKENIZER.pieces[i].decode().strip() for i in np.flatnonzero(TURNS.allowed(jnp.array(place)))}
+    return {TOKENIZER.pieces[i].decode().strip() for i in np.flatnonzero(turns.allowed(jnp.array(place), before))}
 
 
 def test_allowed_tokens_are_those_that_continue_a_turn():
@@ -70,6 +76,16 @@ def test_allowed_tokens_are_those_that_continue_a_turn():
     assert words_after("<touch> xense slide 2n") == {"</touch>"}
     assert words_after("<conclude>") == set(LANGUAGE.words)
     assert words_after("<touch> xense slide 2n </touch>") == set()
+
+
+def test_a_turn_that_must_not_repeat_an_action_names_another_or_concludes():
+    assert words_after("<touch>", turns=ONCE) == {"tac3d", "xense"}
+    assert words_after("<touch>", turns=ONCE, made=(0,)) == {"xense"}
+    assert words_after("<touch>", turns=ONCE, made=(1,)) == {"tac3d", "xense"}
+    assert words_after("<touch> xense", turns=ONCE, made=(1,)) == {"slide"}
+    assert words_after("", turns=ONCE, made=(2, 0, 1)) == {"<conclude>"}
+    assert words_after("<conclude>", turns=ONCE, made=(2, 0, 1)) == set(LANGUAGE.words)
+    assert words_after("", LAST_TURN, turns=ONCE, made=(2, 0)) == {"<conclude>"}
 
 
 @pytest.mark.parametrize("actions", [(), ("press", "press")])
