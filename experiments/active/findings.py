@@ -185,8 +185,8 @@ def plan_tables(
 ) -> tuple[Table, Table]:
     """All outcomes, and those where choices drop out."""
     note = (
-        "Plans by rule are answered by the warm start; `_warm_answers` are the touches of a reinforced policy, answered "
-        "by the warm start; of `_unseen` the touches were chosen without seeing any observation."
+        "Plans by rule are answered by the warm start; `_warm_answers` are the touches of a reinforced policy, "
+        "answered by the warm start; of `_unseen` the touches were chosen without seeing any observation."
     )
     note_missing = (
         f"Each sensor and each motion drops out of an object with probability {learner.dropout:g}, unknown to plan and "
