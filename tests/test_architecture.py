@@ -168,6 +168,7 @@ def test_class_names_are_unique():
     assert not {name: found for name, found in where.items() if len(found) > 1}
 
 
+@pytest.mark.long
 def test_docstrings_open_with_a_noun_or_a_verb():
     """Only the question of an experiment may open with What, Whether or How."""
     wrong = []

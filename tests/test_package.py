@@ -33,6 +33,7 @@ def test_every_folder_of_sources_is_a_package(package):
     assert not [folder for folder in folders if not (folder / "__init__.py").exists()]
 
 
+@pytest.mark.long
 def test_recording_needs_no_jax():
     """As the README of sensors_io says: these import where there is none."""
     needed = (

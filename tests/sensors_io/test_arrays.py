@@ -39,6 +39,7 @@ def test_what_is_no_array_is_refused(tmp_path, data, message):
     refused(ArraysError, message, load_arrays, tmp_path / "a.npy")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
 def test_every_flipped_bit_of_an_archive_is_named_or_harmless(tmp_path, save):
     """A flipped bit in the list of its entries may hide some of them."""

@@ -110,6 +110,7 @@ def generated():
         process.stdin.close()
 
 
+@pytest.mark.long
 def test_kill_9_at_five_places_changes_no_byte(tmp_path, generated):
     """Inside a shard, before and after it is published, inside the index, after it: the files come out the same."""
     whole, killed = tmp_path / "whole", tmp_path / "killed"

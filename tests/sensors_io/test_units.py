@@ -101,6 +101,7 @@ def test_a_worker_that_dies_costs_its_unit_one_more_run_and_a_unit_that_fails_no
     assert sorted(line.partition(": its worker died")[0] for line in said) == ["u1"] + ["u4"] * (not goes_on)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGKILL"])
 def test_workers_end_with_their_driver(name, folder):
     """One that was preempted leaves as by Control-C, and the same command goes on."""

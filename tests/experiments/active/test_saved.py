@@ -32,6 +32,7 @@ def test_it_asks_for_each_contact_once_and_concludes(asking):
     assert found.probabilities.sum() == pytest.approx(1)
 
 
+@pytest.mark.long
 def test_what_is_observed_changes_the_answer_and_nothing_observed_does_not(asking):
     one, question = asking
     seen = [one.ask(question, lambda choice, s=s: frames(s)).probabilities for s in range(3)]
@@ -71,6 +72,7 @@ def test_a_damaged_folder_is_named(tmp_path, damage):
         read_explorer(folder)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -191,6 +191,7 @@ def test_the_command_prints_json_and_writes_a_page(runs, records, tmp_path, caps
     assert re.search(r"hardness +[\d.]+ % \[[\d.]+, [\d.]+\] right of 5; always the most frequent level ", printed)
 
 
+@pytest.mark.long
 def test_what_cannot_be_asked_is_one_line(runs, records, capsys):
     for words, message in (
         (("trial/latest/ordinal", "generated"), "has sft/0; name RUN/ARM/SEED"),
@@ -232,6 +233,7 @@ def test_a_name_that_is_not_utf_8_gets_a_page(runs, tmp_path, capsys):
     assert "must be a file" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_a_damaged_result_is_named_where_its_card_is_written(runs, tmp_path, capsys):
     results = runs / "trial" / "latest" / "results.json"
     before = results.read_text()

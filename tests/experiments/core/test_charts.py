@@ -68,6 +68,7 @@ def test_lines_pass_through_their_points_and_rows_stand_from_the_top():
     assert spans[1][1][0] - spans[1][0][0] == pytest.approx(2 * (spans[0][1][0] - spans[0][0][0]), abs=0.01)
 
 
+@pytest.mark.long
 def test_points_are_named_unless_missing_and_the_same_data_give_the_same_bytes():
     points = [(f"method {i}", 1.0 + i % 3, 0.1 + i % 2, 0.5) for i in range(6)]  # some of them in one place
     drawn = speed_against_error({"kind": points}, "error", (2.0, 0.3))
@@ -134,6 +135,7 @@ def test_running_mean_is_over_a_twentieth_of_the_points():
     assert running_mean(np.eye(100)[50])[47:54].tolist() == pytest.approx([0, 0.2, 0.2, 0.2, 0.2, 0.2, 0])
 
 
+@pytest.mark.long
 def test_a_chart_of_many_lines_stays_small():
     """Twenty arms of ten seeds and 1,000 steps in three panels, whose points would be some 4 MB."""
     curve = np.arange(1000), np.random.default_rng(0).normal(size=1000)

@@ -61,6 +61,7 @@ def train(folder, at_once, seeds=3) -> tuple[list[float], bytes]:
     return found, (folder / "metrics.jsonl").read_bytes()
 
 
+@pytest.mark.long
 def test_results_and_log_do_not_depend_on_how_many_run_at_once(tmp_path):
     apart, log = train(tmp_path / "one", 1)
     assert apart == [15.0, 21.0, 27.0]
@@ -108,6 +109,7 @@ def test_an_error_of_one_ends_the_others_after_their_step(tmp_path):
         assert concurrently(context, "again", (2,), lambda seed: add_up(context, seed)) == [27.0]
 
 
+@pytest.mark.long
 def test_a_signal_ends_all_after_their_step_and_the_run_resumes_with_the_same_bits(tmp_path):
     _, log = train(tmp_path / "whole", 1)
     stopping, struck = Stopping(), []

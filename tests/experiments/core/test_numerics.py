@@ -38,6 +38,7 @@ def test_flags_in_a_file_and_variables_of_accelerators_are_settings(monkeypatch,
     assert numerics.changed(before, numerics.settings()) == ("NVIDIA_TF32_OVERRIDE was None and is '1'",)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "value"), [("jax_default_prng_impl", "rbg"), ("jax_softmax_custom_jvp", None)])
 def test_a_run_is_not_continued_under_other_settings(tmp_path, capsys, name, value):
     order = ["coin", "--runs-dir", str(tmp_path), "--cache-dir", str(tmp_path / "data"), "--scale", "smoke"]

@@ -84,6 +84,7 @@ def test_a_run_leaves_the_agreed_files(capsys):
     assert "report.html" in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_a_crashed_run_is_continued_to_the_same_files(monkeypatch, capsys):
     arguments = ("coin", "--seeds", "2", "--crash-at", "7")
     monkeypatch.setenv("COIN_CRASHES", "1")
@@ -100,6 +101,7 @@ def test_a_crashed_run_is_continued_to_the_same_files(monkeypatch, capsys):
     assert a["arms"] == b["arms"]
 
 
+@pytest.mark.long
 def test_another_configuration_or_fresh_starts_anew(monkeypatch):
     monkeypatch.setenv("COIN_CRASHES", "1")
     for extra in ((), ("--steps", "9"), ("--fresh",)):

@@ -58,6 +58,7 @@ def test_a_stopped_sweep_goes_on_and_runs_nothing_twice(workplace, monkeypatch, 
     assert "unpaid: OMAE" in shown
 
 
+@pytest.mark.long
 def test_a_sweep_with_more_values_keeps_what_its_folder_holds(workplace, capsys):
     for values in ("2", "2,3"):
         arguments = ("coin", "--vary", f"seeds={values}", "--steps", "1", "--into", "mine", "--figures", "omae")

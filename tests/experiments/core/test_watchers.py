@@ -149,6 +149,7 @@ def test_a_resumed_stage_shows_what_its_last_session_logged(tmp_path):
     assert curve(folder, "levels") == {}
 
 
+@pytest.mark.long
 def test_a_run_writes_events_when_asked_and_needs_the_package(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["coin", "--scale", "smoke", "--tensorboard"], package=FAKES) == 0
@@ -163,6 +164,7 @@ def test_a_run_writes_events_when_asked_and_needs_the_package(tmp_path, monkeypa
     assert sorted(tmp_path.glob("runs/coin/*")) == runs
 
 
+@pytest.mark.long
 def test_a_run_sends_its_figures_when_asked_and_goes_on_in_the_same_place(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     orders, sent = [], Mock()  # a run of Weights & Biases

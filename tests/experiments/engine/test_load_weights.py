@@ -49,6 +49,7 @@ def silent(done: int, total: int) -> None:
     del done, total
 
 
+@pytest.mark.long
 def test_readers_read_the_same_small_numbers(checkpoint):
     folder, size, progress = checkpoint
     assert progress == sorted(progress)

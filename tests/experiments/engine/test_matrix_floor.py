@@ -52,6 +52,7 @@ def test_a_table_ends_with_the_rest_and_the_sum():
     assert rows[-1][1:3] == (SHOWN + 2, pytest.approx(2.0 * (SHOWN + 2)))
 
 
+@pytest.mark.long
 def test_single_products_take_time():
     square = jax.make_jaxpr(lambda x: x @ x)(jnp.ones((4, 4)))
     (one,) = time_products(square.jaxpr, 1, rounds=2)

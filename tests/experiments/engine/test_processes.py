@@ -30,6 +30,7 @@ def test_progress_arrives_before_the_answer(heard):
     assert heard == [(1, 3), (2, 3), (3, 3)]
 
 
+@pytest.mark.long
 def test_errors_come_back_and_a_process_that_ends_is_not_waited_for(heard):
     with pytest.raises(ZeroDivisionError):
         in_own_process(divmod, 1, 0)

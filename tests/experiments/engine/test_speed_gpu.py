@@ -39,6 +39,7 @@ def test_devices_are_known_by_their_names():
 HEADS = GpuConfig(prompts=2, tokens=12, heads=4, kv_heads=2, head_dim=8)
 
 
+@pytest.mark.long
 def test_both_kinds_of_attention_agree_in_float32_and_nearly_in_bfloat16():
     heads = draw_heads(HEADS)
     variants = {"engine": engine_attention, "flash": flash_attention("xla")}

@@ -101,6 +101,7 @@ class SlowBatches:
     set_state = get_state
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("batch_s", "step_s", "idle", "off"), [(0.0, 0.15, 0.0, 0.05), (0.3, 0.1, 2 / 3, 0.1)])
 def test_a_device_stands_still_for_as_long_as_its_batch_is_late(context, batch_s, step_s, idle, off):
     assert idle_share(SlowBatches(batch_s), step_s, 6, context, "slow/0") == pytest.approx(idle, abs=off)

@@ -15,6 +15,7 @@ draw = jax.jit(small.draw, static_argnums=2)
 verified_answers, noise_bank = jax.jit(small.verified_answers), jax.jit(small.noise_bank)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("asked", [0, 1])
 def test_verified_answers_name_the_evidence_and_conclude_the_label(asked):
     world = TIDY._replace(asked=asked)

@@ -42,6 +42,7 @@ def test_oracles_agree_where_they_are_installed(context):
     assert max(errors.values()) < 1e-3
 
 
+@pytest.mark.long
 def test_a_dozen_pixels_touch_at_a_millinewton():
     (case,) = (c for c in failure_suite(32) if c.name == "a dozen pixels at 1 mN")
     assert stability_contact.attempt(case).flagged is False

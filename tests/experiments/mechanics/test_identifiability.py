@@ -98,6 +98,7 @@ def test_reading_the_training_records_is_cross_fitting(questions):
     assert own.right.mean() > 0.8
 
 
+@pytest.mark.long
 def test_an_object_is_predicted_by_a_probe_that_never_saw_it(questions):
     _, labels, objects = questions
     names = np.eye(30, dtype=np.float32)[objects]  # determine everything about objects that were trained on

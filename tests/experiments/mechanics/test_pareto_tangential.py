@@ -40,6 +40,7 @@ def test_two_solvers_meet_at_the_exact_traction(contacts, task):
         assert off.max() < 0.02
 
 
+@pytest.mark.long
 def test_a_force_is_carried_by_every_method(contacts):
     kernels, cases, _ = contacts
     most = np.asarray(cases.friction * cases.ramp_mpa[:, -1].sum((1, 2))) * float(kernels.spacing_mm) ** 2

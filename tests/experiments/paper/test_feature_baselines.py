@@ -64,6 +64,7 @@ def test_streams_that_are_not_shared_do_not_count():
     assert alone[:, :, 0].tolist() == [[0, 1], [-1, -1]]
 
 
+@pytest.mark.long
 def test_a_probe_reads_a_stream_and_gives_bottom_where_it_is_absent():
     (known, label), (asked, truth) = two_streams(noise=0.05), two_streams(noise=0.05, seed=1)
     present = np.arange(60)[:, None] > 0

@@ -152,6 +152,7 @@ def test_a_damaged_folder_is_named(folder, tmp_path, file, message):
         read_adapted(tmp_path / "copy")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("file", "change", "message"),
     [
@@ -186,6 +187,7 @@ def test_a_folder_of_another_version_is_named(folder, tmp_path, file, change, me
         read_adapted(copy)
 
 
+@pytest.mark.long
 def test_released_weights_that_are_missing_or_others_are_named(saved, weights, tmp_path):
     save_adapted(tmp_path / "policy", saved, "nowhere")
     with pytest.raises(PolicyError, match=r"its released weights are not in .*nowhere; say where by --weights DIR"):

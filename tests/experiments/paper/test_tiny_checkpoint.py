@@ -39,6 +39,7 @@ def test_drawn_answers_parse_and_agree_with_themselves(writer, batch):
         assert said.conclude[asked] == said.compare[asked] == counts.argmax()
 
 
+@pytest.mark.long
 def test_the_prompt_names_sensors_and_shows_empty_touch(writer, batch):
     """Of the words of a prompt those alone are left out that stand for touch and picture."""
     layout, slots = writer.layout, writer.fns.slots

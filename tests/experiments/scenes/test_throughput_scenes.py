@@ -43,6 +43,7 @@ def cheap(monkeypatch):
     return monkeypatch
 
 
+@pytest.mark.long
 def test_the_experiment_runs_shrunken(cheap, tmp_path):
     def killed(command, out, kills, shards, shard_s, seed, advance):
         assert command[6:10] == ["--objects", "4", "--sequences", "32"]

@@ -159,6 +159,7 @@ def test_levels_are_given_contact_by_contact_and_by_single_sensors(study):
     assert (np.asarray(said.parsed.perceive)[~present] == -1).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("reward", "message"),
     [

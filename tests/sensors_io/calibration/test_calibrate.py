@@ -39,6 +39,7 @@ def real(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     return out
 
 
+@pytest.mark.long
 def test_real_presses_calibrate(real: pathlib.Path) -> None:
     """14 of them, a third as wide as they were recorded: coarser than the published figures, the same order."""
     made = Calibration.load(real)
@@ -79,6 +80,7 @@ def test_the_order_of_the_presses_changes_no_bit(presses: BallPresses) -> None:
     assert [told.kept[i] for i in order] == list(other.kept)
 
 
+@pytest.mark.long
 def test_a_map_that_will_not_transfer_says_so(presses: BallPresses) -> None:
     left = dataclasses.replace(presses, pictures=presses.pictures[TOUCHES[:, 0] < 50])
     strict = dataclasses.replace(QUICK, least_presses=4, sure_radius=1e-4, sure_bias=1e-5)
@@ -88,6 +90,7 @@ def test_a_map_that_will_not_transfer_says_so(presses: BallPresses) -> None:
     assert calibrate(presses, names(presses), "x", fine)[1].warnings == ()
 
 
+@pytest.mark.long
 def test_presses_that_cannot_calibrate_are_refused(presses: BallPresses) -> None:
     washed = np.clip(presses.pictures.astype(int) * 8 - 770, 0, 255).astype(np.uint8)
     grey = np.repeat(presses.pictures[..., :1], 3, -1)

@@ -17,6 +17,7 @@ def presses() -> BallPresses:
     return press_ball(TOUCHES)
 
 
+@pytest.mark.long
 def test_centres_and_radii_are_found(presses: BallPresses) -> None:
     found = find_circles(presses)
     np.testing.assert_allclose(found.touches.stacked(), TOUCHES, atol=0.4)

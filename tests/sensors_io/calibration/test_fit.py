@@ -24,6 +24,7 @@ def colours(presses: BallPresses) -> ColourMap:
     return fit_map(presses, find_circles(presses).touches)
 
 
+@pytest.mark.long
 def test_normals_of_an_unseen_press_come_out(presses: BallPresses, colours: ColourMap) -> None:
     touch = np.array([[50.0, 42.0, 11.0]])
     unseen = press_ball(touch)
@@ -41,6 +42,7 @@ def test_centres_are_moved_to_where_the_map_sees_them(presses: BallPresses, colo
     np.testing.assert_allclose(moved.stacked(), TOUCHES, atol=0.35)
 
 
+@pytest.mark.long
 def test_held_out_errors_are_small_and_of_every_press(presses: BallPresses) -> None:
     errors = cross_validate(presses, "x", folds=2, repeats=2)
     assert errors.depth_um.shape == (2, 14)

@@ -51,6 +51,7 @@ def test_free_motion_is_recorded_from_a_replay(tmp_path, press, capsys):
     assert "nothing was missing: cup, site 0 is complete; name another --site" in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_a_replay_that_ends_leaves_its_contact_in_the_records(tmp_path, press, capsys):
     """The protocol asks for 20 N, the recording ends at 3: kept as incomplete, with the force of the sensor itself."""
     out = tmp_path / "records"

@@ -154,6 +154,7 @@ with BridgeConfig(python=sys.argv[1], adapter="dmtac").open() as device:
 """
 
 
+@pytest.mark.long
 def test_a_killed_reader_takes_its_server_along(vendors, request):
     """SIGKILL, while the server's pipe is full and its SDK still working."""
     command = [sys.executable, "-c", READER, vendors["with"]]

@@ -47,6 +47,7 @@ def test_a_contact_of_records_with_all_of_its_arrays(tmp_path):
         ReplayConfig(path=tmp_path, sensor="dmtac").open(JumpingClock()).__enter__().read(1.0)
 
 
+@pytest.mark.long
 def test_a_generated_sensor_is_a_device():
     scenes = SceneConfig(objects=1, sites=1, frames=3, contact_grid=24)  # of which other tests compile the program
     device = SceneDeviceConfig(sensor="tac3d", scenes=scenes).open(JumpingClock())

@@ -68,6 +68,7 @@ def rich(path: pathlib.Path) -> pathlib.Path:
     return path
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", NEEDS)
 def test_every_array_and_time_comes_back_equal(tmp_path, kind):
     pytest.importorskip(NEEDS[kind])

@@ -95,6 +95,7 @@ record_session(sys.argv[1], CONFIG, sensors, hand_.Scale(hand), show=show)
 """
 
 
+@pytest.mark.long
 def test_a_kill_loses_no_frame_of_any_sensor_that_was_shown(tmp_path):
     """SIGKILL in the middle of the press; every frame that the session had reported is in the records afterwards."""
     root = pathlib.Path(__file__).resolve().parents[3]

@@ -23,6 +23,7 @@ def test_an_unfit_law_is_refused():
         fit.promised(fit.start(), np.full((9, 1), 1e-6), np.ones((9, 1)), [0.1])
 
 
+@pytest.mark.long
 def test_the_fit_finds_the_law_that_made_the_errors():
     rng = np.random.default_rng(1)
     features = np.concatenate([np.ones((80, 1)), rng.normal(0, 0.5, (80, len(FEATURES) - 1))], 1)

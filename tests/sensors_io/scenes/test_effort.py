@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 
 from sensors_io import codec
 from sensors_io.scenes import effort, protocol
@@ -30,12 +31,14 @@ def _cost(chosen):
     return setting.cost
 
 
+@pytest.mark.long
 def test_less_error_takes_more_effort_and_what_cannot_be_met_is_said():
     costs = [_cost(_choose(error)) for error in (0.5, 0.1, 0.03)]
     assert costs == sorted(costs)
     assert (_choose(0.9).met, _choose(1e-4).met) == (True, False)
 
 
+@pytest.mark.long
 def test_records_say_on_which_grid_they_were_solved():
     asking = dataclasses.replace(CONFIG, error=1e-4)
     made = make_sequence(asking, 0, protocol.slot(asking, 0), ORDER, 0)

@@ -39,6 +39,7 @@ def presses(profiles: fitting.Profiles) -> BallPictures:
     return BallPictures(pictures=np.array(made), background=flat, radius_mm=RADIUS_MM, mm_per_px=SCALE)
 
 
+@pytest.mark.long
 def test_the_field_is_the_gradient_of_its_depth(profiles: fitting.Profiles) -> None:
     axis = np.arange(-3, 3, 0.05)
     depth, d_x, d_y = profiles.field(np.array([0.4, -0.3, 1.7]), axis[None, :], axis[:, None])
@@ -49,6 +50,7 @@ def test_the_field_is_the_gradient_of_its_depth(profiles: fitting.Profiles) -> N
     np.testing.assert_allclose(d_y[smooth], numeric_y[smooth], atol=0.03)
 
 
+@pytest.mark.long
 def test_optics_and_touches_are_found_again(presses: BallPictures, profiles: fitting.Profiles) -> None:
     train = np.arange(0, 16, 2)
     begun = _touches() + np.random.default_rng(3).uniform(-0.4, 0.4, (16, 3))

@@ -40,6 +40,7 @@ def test_frames_and_keys_are_independent(frames):
     assert np.abs(np.corrcoef(flat**2) - np.eye(16)).max() < 5 / np.sqrt(flat.shape[1])
 
 
+@pytest.mark.long
 def test_uniform_numbers_fill_the_interval():
     x = np.asarray(jax.jit(noise.uniform, static_argnums=1)(noise.key(np.random.default_rng(3)), (200_000,)))
     assert 0 <= x.min() < x.max() < 1

@@ -31,6 +31,7 @@ def hold():
     return make_sequence(CONFIG, 6, _slot("hold", 8.0), TAC3D, 0)
 
 
+@pytest.mark.long
 def test_friction_follows_the_slide_and_keeps_to_coulomb(slide):
     hand = motions.plan("slide_x", 2.0, schedule.pace(40))
     moving = hand.phase == Phase.MOVE
@@ -92,6 +93,7 @@ def test_a_contact_past_the_limit_is_replaced_by_another_site(monkeypatch, hold)
         assert all(s.flags.any() for s in made)
 
 
+@pytest.mark.long
 def test_limits_lie_where_the_strain_does():
     """The look's limit, on one sensor and a coarse grid, against presses at that force."""
     sites = [site_of(CONFIG, i, 0, 0) for i in range(10)]
@@ -122,6 +124,7 @@ def test_adhesion_counts_in_the_lightest_touches_of_smooth_objects():
     assert 0.1 < share[1] < 0.7
 
 
+@pytest.mark.long
 def test_a_coupled_press_feels_the_spreading_gel_and_an_uncoupled_one_nothing(hold):
     coupled = make_sequence(dataclasses.replace(CONFIG, coupled=True), 6, _slot("hold", 8.0), TAC3D, 0)
     np.testing.assert_array_equal(coupled.depth_mm.shape, hold.depth_mm.shape)

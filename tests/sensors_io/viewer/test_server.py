@@ -168,6 +168,7 @@ def test_streams_end_with_the_view_and_a_taken_port_is_an_error():
     events.close()
 
 
+@pytest.mark.long
 def test_connections_too_many_are_closed():
     with LiveView(port=0) as view:
         port = int(urllib.parse.urlsplit(view.address).port)

@@ -58,6 +58,7 @@ def images():
     return jnp.asarray(np.random.default_rng(1).random((2, 2, 63, 63, 3)), jnp.float32)
 
 
+@pytest.mark.long
 def test_lpips_is_a_symmetric_distance(images):
     weights, (a, b) = lpips_weights(), images
     run = jax.jit(lambda x, y: lpips(x, y, weights))

@@ -55,6 +55,7 @@ def test_a_device_holds_its_share_of_the_published_model(seven, size):
     assert total / size <= sum(jax.tree.leaves(held)) < 1.002 * total / size
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["sft", "grpo", "dynamics"])
 def test_states_of_all_stages_are_named_and_moments_lie_as_their_parameters(name):
     state = PROBLEMS[name]().state

@@ -80,6 +80,7 @@ def test_banned_ids_have_no_probability():
     assert logits.dtype == jnp.float32
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cache_axis", [None, 0], ids=["one cache for all", "a cache each"])
 def test_decoding_a_batch_writes_the_row_that_each_alone_writes(params, cache_axis):
     prefix, tokens, t = prefill(params, jnp.ones((L, D)))[1], jnp.array([7, 9]), jnp.int32(2)

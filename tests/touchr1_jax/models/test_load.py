@@ -20,6 +20,7 @@ def directory(tmp_path):
     return tmp_path
 
 
+@pytest.mark.long
 def test_everything_of_a_directory_is_read(directory):
     found = load_checkpoint(directory, jnp.float32)
     assert found.config.decoder.vocab_size == found.tokenizer.vocab_size == 512

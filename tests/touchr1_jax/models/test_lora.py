@@ -57,6 +57,7 @@ def test_a_dense_layer_by_hand():
     assert base["decoder"]["q_proj"]["kernel"] == 5
 
 
+@pytest.mark.long
 def test_fresh_adapters_change_nothing():
     """Not a bit, operation by operation; a compiler may round otherwise."""
     x = jnp.asarray(np.random.default_rng(0).normal(size=(L, 6)), jnp.float32)

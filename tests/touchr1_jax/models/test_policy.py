@@ -35,6 +35,7 @@ def batch():
     return tiny.question_batch(1, P)
 
 
+@pytest.mark.long
 def test_positions_by_hand():
     """Frame indices are in them: frames 0 and 3, and 2 and 5, keep their distance of three."""
     ours = prompt_positions(jnp.asarray(TIME), jnp.asarray(HAND_MASK), SLOTS, grid=2)
@@ -78,6 +79,7 @@ def test_absent_streams_and_views_hold_nothing(batch, content):
     np.testing.assert_array_equal(logits(batch.replace(features=without)), logits(batch.replace(features=filled)))
 
 
+@pytest.mark.long
 def test_absent_stream_is_a_prompt_without_its_tokens(batch):
     """Oracle: the same prompt with name and tokens of stream 0 cut out, under a layout of one stream."""
     f = batch.features

@@ -106,6 +106,7 @@ def rollout(batch):
     return draw(tiny.params(), batch, jax.random.key(3))
 
 
+@pytest.mark.long
 def test_learner_sees_the_log_probabilities_of_the_sampler(batch, rollout):
     logits = group_logits(tiny.params(), batch.features, batch.ids, batch.mask, rollout.tokens)
     learner = token_log_probs(jax.nn.log_softmax(logits), rollout.tokens)
@@ -113,6 +114,7 @@ def test_learner_sees_the_log_probabilities_of_the_sampler(batch, rollout):
     np.testing.assert_allclose(jnp.where(rollout.mask, learner, 0), rollout.log_prob, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.long
 def test_greedy_completion_is_the_most_likely_token_at_every_step(batch):
     greedy = dataclasses.replace(DRAW, group=1, greedy=True)
     said = jax.jit(lambda p, b, k: sample_group(tiny.FNS, p, b, k, greedy))(tiny.params(), batch, jax.random.key(0))
@@ -146,6 +148,7 @@ def test_empty_cache_has_the_shape_of_the_decoder(layers, stacks):
     assert shapes == [((*n, c.num_kv_heads, 7, c.head_dim),) * 2 for n in stacks]
 
 
+@pytest.mark.long
 def test_blind_features_hold_no_touch():
     batch = tiny.touch_batch(0, 1)
     blind = jax.jit(lambda b: tiny.FNS.encode(tiny.params(), b, blind=True))(batch)

@@ -69,5 +69,6 @@ def test_a_fresh_predictor_copies_what_is_shown(inputs):
     np.testing.assert_array_equal(out[:, 1], 0)
 
 
+@pytest.mark.long
 def test_layer_norm_by_hand():
     np.testing.assert_allclose(layer_norm(jnp.array([1.0, 3.0])), [-1, 1], rtol=1e-5)

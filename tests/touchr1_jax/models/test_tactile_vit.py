@@ -41,6 +41,7 @@ def patches(request):
     return jax.jit(lambda x: module.apply(params, x))
 
 
+@pytest.mark.long
 def test_a_patch_sees_its_own_pixels_and_no_others(patches):
     """Patch p of a step lies in row p // 3, column p % 3 of the 4 px grid, in the two frames of its step."""
     rng = np.random.default_rng(0)
@@ -204,6 +205,7 @@ def test_a_causal_encoder_does_not_look_ahead():
         np.testing.assert_array_equal(same, [causal, causal, False, False])
 
 
+@pytest.mark.long
 def test_kept_patches_are_the_busy_ones_in_their_places():
     """Two of six patches change: the others are never read, and the kept ones embed as they do among all."""
     frames = np.full((F, H, W, 3), 90.0, np.float32)

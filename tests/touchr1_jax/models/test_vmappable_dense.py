@@ -53,6 +53,7 @@ def test_weights_may_be_batched_too():
     np.testing.assert_allclose(pairs, jax.vmap(jnp.matmul, in_axes=(1, 0))(X, many), rtol=1e-6)
 
 
+@pytest.mark.long
 def test_tangents_and_second_derivatives():
     ours, theirs = (jax.hessian(lambda w, p=p: value(p, w, X[0, 0]))(W) for p in (linear, jnp.matmul))
     np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-5)

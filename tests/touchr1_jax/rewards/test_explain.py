@@ -103,6 +103,7 @@ def test_what_cannot_be_trained_is_not_explained():
         terms_table(branching, {"mine": 1.0}, make_parsed(), iter([("soft", make_target())]))
 
 
+@pytest.mark.long
 def test_what_can_be_nan_is_not_explained():
     """The variance of one sensor's report; training would refuse it with the same words."""
     spread = Reward(lambda p, t: jnp.var(p.perceive[:, 0]) * jnp.sum(t.streams) / (jnp.sum(t.streams) - 1))
@@ -119,6 +120,7 @@ def test_the_truth_about_what_is_not_asked_is_seen():
     assert next(iter(rows[2].cells)) == "1.000"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("arguments", "status"), [([], 0), (["--weights", "accuracy", "0.6", "consistency", "0.3", "format", "0.1"], 1)]
 )

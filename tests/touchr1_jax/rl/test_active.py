@@ -86,6 +86,7 @@ def exact():
     return np.asarray(log_p, np.float64), grads
 
 
+@pytest.mark.long
 def test_the_list_is_complete(exact):
     np.testing.assert_allclose(np.exp(exact[0]).sum(), 1, atol=1e-5)
 
@@ -146,6 +147,7 @@ def test_one_program_serves_all_prices_and_batches():
     assert step._cache_size() == 1
 
 
+@pytest.mark.long
 def test_answers_are_enumerated_with_the_price_of_their_touches():
     """Each level earns what a trajectory with that answer does."""
     algorithm = Paper(constrained=True, gamma=0.0, beta=0.0, enumerated=Norm.NONE, learn_conclusion=False)

@@ -139,6 +139,7 @@ def test_a_bonus_after_normalisation_is_centred_in_its_own_group():
     np.testing.assert_allclose(found, [[0.1, 0.1, -0.2], [0.2, -0.1, -0.1]], atol=1e-7)
 
 
+@pytest.mark.long
 def test_weights_of_prompts_that_count():
     np.testing.assert_allclose(prompt_weights(jnp.array([True, False, True, False])), [0.5, 0, 0.5, 0])
     np.testing.assert_array_equal(prompt_weights(jnp.zeros(3, bool)), [0, 0, 0])

@@ -208,6 +208,7 @@ def test_a_sampled_conclusion_is_always_learned():
         Paper(learn_conclusion=False)
 
 
+@pytest.mark.long
 def test_a_step_needs_the_tokens_of_the_levels():
     config = GRPOConfig(prompts=P, micro_prompts=P, algorithm=Rloo(enumerated=Norm.NONE))
     with pytest.raises(ValueError, match="enumerated is set"):

@@ -167,6 +167,7 @@ def test_no_ratio_is_clipped_at_the_first_update_whatever_the_sampler_computed(e
     assert later["clip_share"] > 0
 
 
+@pytest.mark.long
 def test_under_a_cap_the_sampler_counts_in_the_weight_alone(experience):
     cap = 1.2
     config = dataclasses.replace(ALONE, algorithm=dataclasses.replace(ALONE.algorithm, importance_cap=cap))
@@ -212,6 +213,7 @@ def alone():
     return gradient(ALONE)
 
 
+@pytest.mark.long
 def test_zero_advantage_has_a_gradient_of_exactly_zero(experience, alone):
     grads, parts, _ = alone(experience._replace(advantage=jnp.zeros((P, G))))
     assert not any(np.any(g) for g in jax.tree.leaves(grads))
@@ -244,6 +246,7 @@ def grounding_of(one: Experience, touch: jax.Array) -> float:
     return float(jnp.mean(terms_of(one._replace(masked_touch=touch)).grounding, where=one.rollout.mask))
 
 
+@pytest.mark.long
 def test_grounding_is_zero_when_nothing_is_perturbed_and_sees_every_stream(experience):
     """Each stream in turn: no modality is silently left out of the perturbed branch."""
     one = jax.tree.map(lambda x: x[0], experience)

@@ -74,6 +74,7 @@ def test_beliefs_may_take_the_place_of_tokens():
     assert env.reset()[0]["touch"].tolist() == [0, *[-1] * BUDGET]
 
 
+@pytest.mark.long
 def test_episodes_at_once_are_those_alone():
     """Three episodes that touch, touch twice and conclude, and conclude at once; then the last begins anew."""
     bank, batch = jax.tree.map(jnp.asarray, BANK), explored.batch_of(*OBJECTS)

@@ -63,6 +63,7 @@ def test_a_group_that_is_left_out_has_the_mean_of_the_others():
     assert {name: pytest.approx(float(share)) for name, share in shares.items()} == expected
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("comparison", Advantage)
 def test_the_other_advantages_are_those_of_a_batch_without_the_group(comparison):
     """Also where they are compared with σ of the whole batch."""

@@ -263,6 +263,7 @@ def test_what_score_centering_is_not_defined_for_is_named(change, message):
         check_centering(Paper(score_centering=4, **change))
 
 
+@pytest.mark.long
 def test_rollouts_without_the_samplers_tokens_are_named():
     with pytest.raises(ValueError, match=r"score_centering is set, but rollouts lack .*; set rollouts\.url"):
         expected_score(Paper(score_centering=4), None, None)

@@ -66,6 +66,7 @@ def train(step, batch, steps: int) -> jax.Array:
     return jax.nn.softmax(first)[jnp.arange(P), PAYS[jnp.max(batch.target.label, -1)]]
 
 
+@pytest.mark.long
 def test_touch_is_read(step):
     """Nothing but the pattern of the streams says which token is paid; without it one half is the best."""
     pattern = np.arange(P) % 2

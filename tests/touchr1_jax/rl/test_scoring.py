@@ -46,6 +46,7 @@ def test_an_error_of_a_host_reward_names_the_reward():
         jax.block_until_ready(scored(lambda *_: {}["no"]))
 
 
+@pytest.mark.long
 def test_a_host_reward_that_is_nan_costs_its_group_alone():
     wrong = lambda text, parsed, target: np.nan if target.label[0] == 1 else float(parsed.formatted)
     reward, terms, _ = scored(wrong, format=REWARDS["format"])
@@ -104,6 +105,7 @@ def test_a_reward_without_what_it_sees_is_named(reward, message):
         jax.eval_shape(score, TOKENS[0, 0], jax.tree.map(lambda x: x[0], TARGET))
 
 
+@pytest.mark.long
 def test_traced_score_is_the_weighted_sum():
     reward, terms, _ = batched(make_score(PARSER, REWARDS, WEIGHTS))
     np.testing.assert_allclose(reward, sum(terms.values()), rtol=1e-5)

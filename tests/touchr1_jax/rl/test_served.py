@@ -51,6 +51,7 @@ def test_other_types_are_refused():
         torch_file(np.zeros((2, 3)))
 
 
+@pytest.mark.long
 def test_prompts_are_embedded_as_the_decoder_reads_them():
     """Words, touch and view in their places; what a contact lacks does not exist."""
     table, batch = tiny.params()["decoder"]["embedding"]["embedding"], tiny.question_batch(0, 2)

@@ -113,6 +113,7 @@ def test_bonuses_and_their_metrics_by_hand():
     assert metrics == shares
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("form", "cancelled"), [(TactileUse.LITERAL, 1 / 3), (TactileUse.RECOMMENDED, 0)])
 def test_a_literal_bonus_that_follows_the_reward_is_cancelled(form, cancelled):
     """Where σ takes it away: of the two groups with different bonuses the one whose rewards differ as they do."""

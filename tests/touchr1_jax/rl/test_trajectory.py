@@ -57,6 +57,7 @@ def test_a_policy_that_repeats_no_action_takes_each_once():
     assert two == {(-1, -1), (0, -1), (1, -1), (0, 1), (1, 0)}
 
 
+@pytest.mark.long
 def test_actions_tokens_costs_and_answers_tell_one_story(legal):
     known = {tuple(explored.padded(explored.turn_ids(*t))): t for t in explored.trajectories()}
     counts = set()
@@ -82,6 +83,7 @@ def test_observations_are_those_of_the_bank(legal):
     np.testing.assert_array_equal(legal.touch[p, g, b], BANK.tokens[OBJECTS[p], int(legal.action[p, g, b])])
 
 
+@pytest.mark.long
 def test_a_malformed_turn_ends_the_trajectory_without_an_answer():
     said = explore(POLICY.fns, explored.batch_of(*OBJECTS), seed=1)
     lost = np.asarray(said.parsed.truncated)
@@ -100,6 +102,7 @@ def test_the_most_likely_trajectory_needs_no_key():
     np.testing.assert_array_equal(one.rollout.tokens, other.rollout.tokens)
 
 
+@pytest.mark.long
 def test_a_choice_that_dropped_out_is_not_felt(legal):
     batch = explored.batch_of(*OBJECTS)
     case = batch.case._replace(offered=jnp.zeros_like(batch.case.offered))

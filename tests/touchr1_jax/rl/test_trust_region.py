@@ -44,6 +44,7 @@ def test_the_policy_that_sampled_has_the_sampled_log_probabilities(learn):
     np.testing.assert_allclose(np.asarray(ours)[mask], np.asarray(learn.rollout.log_prob)[mask], atol=1e-4)
 
 
+@pytest.mark.long
 def test_a_short_update_stays(shorten):
     params, size = shorten(1e-3)
     assert size["update_scale"] == 1
@@ -52,6 +53,7 @@ def test_a_short_update_stays(shorten):
         np.testing.assert_allclose(a, b + 1e-3 * d, atol=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", [0.1, 3.0], ids=["a little too long", "far too long"])
 def test_a_long_update_ends_near_its_bound(shorten, size):
     """One shortening is enough where KL is quadratic; a far update, where KL is flat, needs several."""

@@ -121,6 +121,7 @@ def test_the_reference_is_refreshed_on_time():
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.long
 def test_a_state_without_a_reference_cannot_refresh_it():
     config = of(Paper(reference_every=2))
     state = start_state(tiny.shallow_params(0), OPTIMIZER, jax.random.key(1), of(Paper()))
@@ -176,6 +177,7 @@ def test_tactile_use_samples_the_controls(algorithm):
     assert moved(state) > 0
 
 
+@pytest.mark.long
 def test_a_literal_bonus_is_a_term_of_the_reward():
     config = of(Paper(tactile_use=TactileUse.LITERAL))
     step = make_grpo_step(FNS, score, OPTIMIZER, config)

@@ -35,6 +35,7 @@ def draw(tokenizer: Tokenizer, length: int, rows: int, key: int = 0):
     return jax.tree.map(lambda x: x[0], jax.jit(run)(jax.random.key(key)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "extra"), [("words", 0), ("words", 12), ("characters", 0), ("characters", 40)])
 def test_every_draw_is_formatted_and_ends(name, extra):
     tokenizer = TOKENIZERS[name]

@@ -79,6 +79,7 @@ def test_class_of_empty_tokens_changes_nothing():
     assert not lexer.events[0].any()
 
 
+@pytest.mark.long
 def test_tables_stay_small_for_a_big_vocabulary():
     rng = np.random.default_rng(0)
     letters = np.frombuffer(b"abcdefghijklmnopqrstuvwxyz .,<>/-_A", np.uint8)

@@ -154,6 +154,7 @@ def test_structure(text, expected):
     assert hardness(text) == expected
 
 
+@pytest.mark.long
 def test_truncated_answer_is_read_as_it_stands():
     parsed = parse(GOOD, end=False)
     assert parsed.truncated

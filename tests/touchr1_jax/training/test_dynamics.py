@@ -73,6 +73,7 @@ def test_errors_by_hand():
     assert prediction_errors(predicted, goal, steps) == (0.5, 2.0)
 
 
+@pytest.mark.long
 def test_spread_is_between_contacts_of_one_sensor_at_one_step():
     """Dimension 0 differs between sensors and steps alone, dimension 1 between contacts alone by ±2."""
     latent = np.zeros((2, 2, 3, 1, 2), np.float32)
@@ -84,6 +85,7 @@ def test_spread_is_between_contacts_of_one_sensor_at_one_step():
     np.testing.assert_allclose(spread_of(jnp.asarray(latent), lonely)[1], np.sqrt(4 + 1e-4), rtol=1e-6)
 
 
+@pytest.mark.long
 def test_covariance_by_hand():
     """Rows ±(1, 2) twice: cov_01 = 2, so 2 · 2² / D."""
     latent = jnp.array([[1.0, 2.0], [-1.0, -2.0]]).reshape(2, 1, 1, 1, 2)
@@ -175,6 +177,7 @@ def test_contacts_are_encoded_alike_one_by_one(state, batch):
     np.testing.assert_allclose(both[1], both[0], rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.long
 def test_fewer_frames_are_read(batch):
     assert read_frames(CONFIG, batch) is batch
     short = read_frames(dataclasses.replace(CONFIG, frames_kept=2), batch)

@@ -46,6 +46,7 @@ def test_an_untrained_head_is_even_and_gives_no_level_that_is_not_there(started)
     np.testing.assert_allclose(p, np.broadcast_to([[1 / 3] * 3, [0.5, 0.5, 0.0]], p.shape), rtol=1e-5)
 
 
+@pytest.mark.long
 def test_labels_are_learned_by_encoder_and_head(started):
     state, batch = started
     before = jax.tree.map(np.array, state.params["encoder"])

@@ -21,6 +21,7 @@ def test_features_are_means_over_the_steps_that_exist():
     np.testing.assert_array_equal(contact_features(latent, exists), [[1, 2, 0, 0]])
 
 
+@pytest.mark.long
 def test_a_probe_reads_what_is_there_and_cannot_read_what_is_not():
     rng = np.random.default_rng(0)
     label = np.stack([rng.integers(0, 3, 240), rng.integers(0, 3, 240)], 1)
@@ -34,6 +35,7 @@ def test_a_probe_reads_what_is_there_and_cannot_read_what_is_not():
     assert right[:, 1].mean() < 0.6
 
 
+@pytest.mark.long
 def test_rank_of_known_shapes():
     rng = np.random.default_rng(0)
     line = np.outer(np.linspace(-1, 1, 50), rng.normal(size=6)).astype(np.float32)

@@ -25,6 +25,7 @@ def problem():
     return features.astype(np.float32), labels, groups
 
 
+@pytest.mark.long
 def test_an_identity_leaks_nothing():
     """Features that are the object's one-hot name: in sample a perfect probe, out of fold no information at all."""
     rng = np.random.default_rng(0)
@@ -56,6 +57,7 @@ def test_unlabelled_rows_are_read_but_not_learned_from(problem):
     assert np.isfinite(without).all()
 
 
+@pytest.mark.long
 def test_rows_that_are_only_read_change_no_other_and_are_read_by_a_probe_of_all_others(problem):
     features, labels, groups = problem[:3]
     n, read_only = len(labels), np.arange(len(labels)) // 3 % 4 == 0
@@ -96,6 +98,7 @@ def test_fit_is_the_optimum_that_scipy_finds(problem):
     np.testing.assert_allclose(ours, scipy_log_probs(features, labels, weight, CONFIG.penalty), atol=2e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("constant", [0.0, 5.3, -9.21034])
 def test_a_feature_that_is_constant_in_training_says_nothing(problem, constant):
     """Its spread is rounding noise, which must not be scaled up: the held-out rows may hold another value."""

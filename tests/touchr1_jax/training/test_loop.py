@@ -68,6 +68,7 @@ def whole(home):
     return run(home, feed())
 
 
+@pytest.mark.long
 def test_lines_come_in_order_once_each_from_zero(whole):
     assert [t for t, _ in whole[1]] == list(range(STEPS))
     assert int(whole[0].step) == STEPS

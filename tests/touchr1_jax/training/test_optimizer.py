@@ -26,6 +26,7 @@ def update_sizes(optimizer: optax.GradientTransformation, steps: int) -> np.ndar
     return np.array(sizes)
 
 
+@pytest.mark.long
 def test_rate_warms_up_to_the_scaled_rate_and_decays_to_its_share():
     sizes = step_sizes(CONFIG, 12)
     assert CONFIG.peak == pytest.approx(1e-3)

@@ -191,6 +191,7 @@ def other_inputs(batch: SFTBatch, example: int) -> list[SFTBatch]:
     return [batch.replace(touch=touch), batch.replace(ids=ids), batch.replace(tokens=tokens)]
 
 
+@pytest.mark.long
 def test_no_input_of_an_example_changes_another(batch, scores):
     """Bit for bit: log-probabilities of all tokens of a row, before and after."""
     run, examples = scores
@@ -239,6 +240,7 @@ def test_one_program_for_batches_that_fill_other_rows(params):
     np.testing.assert_allclose(losses, [float(padded(params, b)[0]) for b in batches], rtol=1e-5)
 
 
+@pytest.mark.long
 def test_the_host_knows_which_tokens_exist(params, batch):
     features = jax.jit(lambda p, touch: FNS.encode(p, touch))(params, batch.touch)
     exists = existing_tokens(FNS.module, FNS.slots, batch.touch, batch.mask, batch.streams, batch.token_mask)

@@ -155,6 +155,7 @@ def test_a_few_answers_are_learned_by_heart(params, batch):
     assert step._cache_size() == 1
 
 
+@pytest.mark.long
 def test_blind_loss_does_not_depend_on_touch(params, batch):
     blind = jax.jit(lambda p, b: sft_loss(FNS, p, b, blind=True)[0])
     other = batch.touch.replace(frames=255 - batch.touch.frames, force_n=-batch.touch.force_n)

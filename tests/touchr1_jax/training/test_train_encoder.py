@@ -69,6 +69,7 @@ def test_the_encoders_learn_and_the_decoder_stays():
     assert not np.array_equal(found["tactile"]["stem"]["kernel"], params["tactile"]["stem"]["kernel"])
 
 
+@pytest.mark.long
 def test_statistics_that_were_computed_before_give_the_same_features():
     batch = contacts(2).replace(
         frame_mask=np.arange(tiny.FRAMES) < np.array([4, 2])[:, None, None] + np.zeros((2, 2, 1))
@@ -78,6 +79,7 @@ def test_statistics_that_were_computed_before_give_the_same_features():
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-3), pixels, computed)
 
 
+@pytest.mark.long
 def test_the_head_reads_what_is_there():
     features = tiny.features(0, 2)
     width = read_tokens(features).shape[-1]

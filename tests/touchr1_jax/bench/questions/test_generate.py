@@ -120,6 +120,7 @@ def test_no_word_depends_on_the_answer(items):
     assert {key[2] for key in questions} == set(range(WORDINGS))
 
 
+@pytest.mark.long
 def test_the_same_seed_gives_the_same_bytes(source, quota, found, tmp_path):
     for name, kept in (("a", found.kept), ("b", generate(source, quota, 0).kept)):
         write_items(tmp_path / name, kept)

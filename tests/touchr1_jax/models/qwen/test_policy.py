@@ -55,6 +55,7 @@ def test_view_fills_its_tokens(batch):
     assert batch.features.view.shape == (P, VIEW_TOKENS, CONFIG.decoder.hidden_size)
 
 
+@pytest.mark.long
 def test_positions_are_those_of_the_model(batch):
     """Block by block: words, the view, and each stream at its integer frame indices."""
     features = jax.tree.map(lambda x: x[1], batch.features)
@@ -183,6 +184,7 @@ def test_sft_with_adapters_and_a_whole_tactile_encoder():
     assert all(jax.tree.leaves(moved))
 
 
+@pytest.mark.long
 def test_half_precision_decodes_as_the_learner_scores(batch):
     """Keys and values of a bfloat16 decoder are bfloat16; both ways agree to its rounding."""
     half = jax.tree.map(lambda x: (0.5 * x).astype(jnp.bfloat16), {"decoder": small_policy.params()["decoder"]})
@@ -216,6 +218,7 @@ def test_pretrained_towers_stand_beside_fresh_ones():
         init_on_pretrained(*of, {**model, "decoder": {}})
 
 
+@pytest.mark.long
 def test_view_sizes_are_checked():
     view = QwenViewConfig(tower_config=CONFIG.vision, height_px=33, width_px=15, budget=PixelBudget(least=64, most=512))
     assert (view.size, view.grid, view.tokens) == ((32, 16), 2, 8)

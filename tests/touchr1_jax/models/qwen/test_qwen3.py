@@ -173,6 +173,7 @@ def test_packed_rows_are_the_prompts(policy, batch):
     np.testing.assert_allclose(ours, wanted, rtol=0, atol=2e-5 * float(jnp.abs(wanted).max()))
 
 
+@pytest.mark.long
 def test_a_wrong_folder_gives_one_error(folder, tmp_path):
     shutil.copytree(folder, tmp_path / "copy")
     settings = tmp_path / "copy" / "preprocessor_config.json"

@@ -58,6 +58,7 @@ def test_full_layers_see_the_frame_and_no_other(params):
     np.testing.assert_array_equal(seen, frame[:, None] == frame)
 
 
+@pytest.mark.long
 def test_pictures_together_are_pictures_apart(params):
     """Sizes differ, so that windows and frames are padded."""
     config = dataclasses.replace(CONFIG, full_layers=(1,))
@@ -70,6 +71,7 @@ def test_pictures_together_are_pictures_apart(params):
     np.testing.assert_allclose(encode(params, x, *grids, config=config), wanted, rtol=0, atol=rounding)
 
 
+@pytest.mark.long
 def test_parameters_fix_the_precision(params):
     half = jax.tree.map(lambda x: x.astype(jnp.bfloat16), params)
     ours = encode(half, patches(GRID), GRID)

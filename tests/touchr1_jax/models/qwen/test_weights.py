@@ -91,6 +91,7 @@ def test_every_layout_gives_the_same_parameters(tmp_path, weights, expected, ren
     assert_equal(load_params(tmp_path, CONFIG, jnp.float32), expected)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("stored", "wanted"), [(np.float32, jnp.bfloat16), (np.float16, jnp.float32), (jnp.bfloat16, jnp.float32)]
 )
@@ -231,6 +232,7 @@ def test_index_must_be_one(tmp_path, content):
         load_params(tmp_path, CONFIG)
 
 
+@pytest.mark.long
 def test_loaded_parameters_lie_where_they_are_asked_to(tmp_path, weights, expected):
     write_file(tmp_path / "model.safetensors", weights)
     mesh = MeshConfig().build(jax.devices()[:1])
