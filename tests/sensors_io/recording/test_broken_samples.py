@@ -13,7 +13,7 @@ from sensors_io.recording.session import record_session
 from sensors_io.records import CorruptRecordsError, RecordStore
 from sensors_io.schema import Flag, SchemaError
 from tests.sensors_io.checks import refused
-from tests.sensors_io.recording.hand import Camera, Hand, Scale, Skin
+from tests.sensors_io.recording.hand import MS, Camera, Hand, Scale, Skin
 from tests.sensors_io.recording.test_session import CONFIG, SHORT
 
 FREE = dataclasses.replace(CONFIG, free_s=0.5)
@@ -98,6 +98,22 @@ class Heavy(Scale):
     def drain(self):
         arrays = {"force_n": np.array([70.0, 0, 1.0], np.float32), "moment_nmm": np.array([0, 600, 0], np.float32)}
         return [Sample(host_time_ns=s.host_time_ns, arrays=arrays) for s in super().drain()]
+
+
+class Overlapping(Scale):
+    """Records of a datagram that was held up are stamped before the last ones of the datagram ahead of it."""
+
+    def drain(self):
+        early_ns = 7 * MS if self.hand.time_ns == 10**9 + 200 * MS else 0
+        return [dataclasses.replace(s, host_time_ns=s.host_time_ns - early_ns) for s in super().drain()]
+
+
+def test_forces_whose_times_overlap_are_kept(tmp_path):
+    hand = Hand()
+    record_session(tmp_path, FREE, [Camera(hand)], Overlapping(hand), show=hand.show)
+    made = RecordStore(tmp_path).contact(0)["gelsight_mini"]
+    np.testing.assert_array_equal(made.force_n, np.zeros((len(made), 3)))
+    assert not made.flags.any()
 
 
 def test_stamps_past_64_bits_leave_the_device_clock_out(tmp_path):
