@@ -36,10 +36,11 @@ from tests.mutations import check_parser, file_of, mutated, written
 from tests.sensors_io import fakes
 from tests.sensors_io.devices.test_netft import NEWTONS
 from tests.sensors_io.devices.test_tac3d import datagrams, pushed
+from tests.touchr1_jax.models.qwen.cases import SHAPES, qwen3_json
 from tests.touchr1_jax.text.vocabularies import trained_bpe
 from touchr1_jax.bench.json_lines import read_lines
-from touchr1_jax.models.qwen import config as qwen_config
 from touchr1_jax.models.qwen import safetensors
+from touchr1_jax.models.qwen.config_file import CONFIG_FILE, read_config
 from touchr1_jax.text import tokenizer
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 
@@ -48,6 +49,7 @@ SEPARATOR = b"\xfe\xfd\xfc"
 NAMES = (
     "Tac3D", "Net F/T", "bridge", "sequence", "card", "journal", "index", "npz", "npy", "calibration", "pickle",
     "safetensors", "configuration", "tokenizer", "JSON Lines", "index of version 2",
+    "Qwen3 configuration",
 )  # fmt: skip
 PUBLISHED = {
     "model_type": "qwen2_5_vl", "vocab_size": 500, "hidden_size": 64, "intermediate_size": 128,
@@ -159,7 +161,7 @@ def parsers(tmp_path_factory):
     described = [{"name": n, "dtype": a.dtype.str, "shape": a.shape} for n, a in frame.items()]
     header = json.dumps({"number": 1, "stamp_ns": 5, "arrays": described}).encode()
     tensors = {"a.weight": np.ones((2, 3), np.float32), "b": np.zeros(4, jnp.bfloat16)}
-    published = json.dumps(PUBLISHED).encode()
+    configuration = file_of(folder / "checkpoint" / CONFIG_FILE, lambda path: read_config(path.parent))
     message = {**pushed([0, 0, -1], [0, 0, 0]), "InitializeProgress": np.array([[100.0]])}
     poses = {"timestamps": [0.0, 0.5], "poses": np.eye(3), "n": np.float64(2)}
     fakes.write(folder / "records", 2)
@@ -183,11 +185,8 @@ def parsers(tmp_path_factory):
             written(folder, "b.safetensors", lambda path: safetensors.write_file(path, tensors)),
             ValueError,
         ),
-        "configuration": (
-            file_of(folder / "checkpoint" / qwen_config.CONFIG_FILE, lambda path: qwen_config.read_config(path.parent)),
-            published,
-            ValueError,
-        ),
+        "configuration": (configuration, json.dumps(PUBLISHED).encode(), ValueError),
+        "Qwen3 configuration": (configuration, json.dumps(qwen3_json(SHAPES[0])).encode(), ValueError),
         "tokenizer": (
             file_of(folder / "tokenizer.json", tokenizer.from_file),
             written(folder, "t.json", lambda path: trained_bpe(TOUCH_LANGUAGE).save(str(path))),
@@ -201,7 +200,7 @@ def parsers(tmp_path_factory):
 def test_a_parser_answers_any_bytes_by_a_value_or_a_documented_error(parsers, name):
     parse, data, documented = parsers[name]
     parse(data)
-    shaped = name in ("index", "configuration", "tokenizer", "index of version 2")
+    shaped = name in ("index", "configuration", "tokenizer", "index of version 2", "Qwen3 configuration")
     check_parser(name, NAMES.index(name), parse, data, documented, shaped=shaped)
 
 
