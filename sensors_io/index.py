@@ -287,7 +287,14 @@ def _no_tables() -> dict[str, GrowingFile]:
 
 
 def _meta(tree: Mapping[str, Any]) -> RecordsMeta:
-    return RecordsMeta(**tree["meta"] | {"sensors": tuple(tree["meta"]["sensors"])})
+    """The meta of a root, whose words and counts are ones, for they are asked for long after it was opened."""
+    meta = RecordsMeta(**tree["meta"] | {"sensors": tuple(tree["meta"]["sensors"])})
+    words = (meta.source, meta.licence, meta.config_hash, *meta.sensors, *tree.get("motions", ()))
+    if not all(isinstance(word, str) for word in words) or not isinstance(meta.notes, Mapping):
+        raise ValueError("a word of its meta or its motions is no text")
+    if not all(type(count) is int for count in tree["frames"].values()) or not isinstance(tree["complete"], bool):
+        raise ValueError("its frames are no counts, or complete is neither true nor false")
+    return meta
 
 
 def _number(file: str) -> int:

@@ -146,6 +146,11 @@ class PeriodGaps:
         self._nominal_ns = self._period_ns = float(period_ns)
         self._phase_ns: float | None = None
 
+    def shift(self, by_ns: int) -> None:
+        """Take note that the clock of the stamps was set forward by so much since the last sample."""
+        if self._phase_ns is not None:
+            self._phase_ns += by_ns
+
     def step(self, time_ns: int) -> CounterStep:
         """Take the stamp of the next sample into account."""
         if self._phase_ns is None:

@@ -65,20 +65,24 @@ class GrowingFile:
         Raises:
           CorruptRecordsError: it is missing or shorter, or its checksum does not hold.
         """
-        fault, crc = "is missing", 0
-        if path.is_file():
-            with path.open("rb") as file:
-                left = self.size
-                while left and (chunk := file.read(min(left, _CHUNK))):
-                    crc, left = zlib.crc32(chunk, crc), left - len(chunk)
-            fault = f"has {self.size - left} bytes where {self.size} were written" if left else ""
-            if not fault and (crc != self.crc32 or self.size % dtype.itemsize):
-                fault = "is damaged: its checksum does not hold"
-        if fault:
+        if fault := self._fault(path, dtype):
             raise CorruptRecordsError(
                 f"{path} {fault}; copy it again from its source, or delete {path.parent} and write it again"
             )
         return np.memmap(path, dtype, "r", shape=(self.size // dtype.itemsize,))
+
+    def _fault(self, path: pathlib.Path, dtype: np.dtype) -> str:
+        """Reason why it cannot be read; empty if there is none.  No more is read than is there, whatever is stated."""
+        if not path.is_file():
+            return "is missing"
+        there, crc, left = path.stat().st_size, 0, self.size
+        if there < self.size:
+            return f"has {there} bytes where {self.size} were written"
+        with path.open("rb") as file:
+            while left > 0 and (chunk := file.read(min(left, _CHUNK))):
+                crc, left = zlib.crc32(chunk, crc), left - len(chunk)
+        whole = not left and crc == self.crc32 and not self.size % dtype.itemsize
+        return "" if whole else "is damaged: its checksum does not hold"
 
 
 class ContactTable(collections.abc.Sequence[ContactKey]):
@@ -103,7 +107,13 @@ class ContactTable(collections.abc.Sequence[ContactKey]):
         if isinstance(i, slice):
             return tuple(self[j] for j in range(*i.indices(len(self))))
         row = self.rows[i]
-        name, motion = self._objects[row["object"]], self._motions[row["motion"]]
+        try:
+            name, motion = self._objects[row["object"]], self._motions[row["motion"]]
+        except IndexError as error:  # by which Python ends a loop: contacts would be missing without a word
+            raise _of_two(
+                f"contact {i} is of object {row['object']} of {len(self._objects)} and motion {row['motion']} of "
+                f"{len(self._motions)}"
+            ) from error
         return ContactKey(object_id=name, site=int(row["site"]), motion=motion, trial=int(row["trial"]))
 
     def __eq__(self, other: object) -> bool:
@@ -117,7 +127,10 @@ class ContactTable(collections.abc.Sequence[ContactKey]):
         """Entry of each sensor that saw contact i, counted through all shards."""
         row = self.rows[i]
         numbers = row["sensors"][row["sensors"] != NO_SENSOR]
-        return {self._sensors[n]: int(row["entry"]) + k for k, n in enumerate(numbers)}
+        try:
+            return {self._sensors[n]: int(row["entry"]) + k for k, n in enumerate(numbers)}
+        except IndexError as error:
+            raise _of_two(f"contact {i} is of sensors {numbers.tolist()} of {len(self._sensors)}") from error
 
     def find(self, key: ContactKey) -> int | None:
         """Number of the contact with a key, `None` if there is none; the first search sorts hashes of all keys."""
@@ -151,6 +164,10 @@ class ContactTable(collections.abc.Sequence[ContactKey]):
         packed.sort()
         forget(self.rows)
         return packed
+
+
+def _of_two(said: str) -> CorruptRecordsError:
+    return CorruptRecordsError(f"{said}: root and tables are of two indices; copy all of them again from their source")
 
 
 def forget(rows: np.ndarray) -> None:

@@ -7,7 +7,9 @@ import contextlib
 import dataclasses
 import io
 import json
+import pathlib
 import pickle
+import shutil
 import socket
 import struct
 import types
@@ -34,17 +36,20 @@ from tests.mutations import check_parser, file_of, mutated, written
 from tests.sensors_io import fakes
 from tests.sensors_io.devices.test_netft import NEWTONS
 from tests.sensors_io.devices.test_tac3d import datagrams, pushed
+from tests.touchr1_jax.models.qwen.cases import SHAPES, qwen3_json
 from tests.touchr1_jax.text.vocabularies import trained_bpe
 from touchr1_jax.bench.json_lines import read_lines
-from touchr1_jax.models.qwen import config as qwen_config
 from touchr1_jax.models.qwen import safetensors
+from touchr1_jax.models.qwen.config_file import CONFIG_FILE, read_config
 from touchr1_jax.text import tokenizer
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 
+VERSION_2 = pathlib.Path(__file__).parent / "sensors_io" / "index_of_version_2.json"
 SEPARATOR = b"\xfe\xfd\xfc"
 NAMES = (
     "Tac3D", "Net F/T", "bridge", "sequence", "card", "journal", "index", "npz", "npy", "calibration", "pickle",
-    "safetensors", "configuration", "tokenizer", "JSON Lines",
+    "safetensors", "configuration", "tokenizer", "JSON Lines", "index of version 2",
+    "Qwen3 configuration",
 )  # fmt: skip
 PUBLISHED = {
     "model_type": "qwen2_5_vl", "vocab_size": 500, "hidden_size": 64, "intermediate_size": 128,
@@ -65,7 +70,9 @@ def tac3d(data):
     assembler, decoder = tac3d_messages.Assembler(), tac3d_messages.Tac3dDecoder()
     for datagram in data.split(SEPARATOR):
         if (whole := assembler.add(datagram)) is not None:
-            tac3d_messages.to_schema(decoder.decode(*whole).matrices)
+            message = decoder.decode(*whole)
+            if message.initialised == 100:
+                tac3d_messages.to_schema(message.matrices)
 
 
 def bridge_frame(data):
@@ -91,7 +98,20 @@ def journal(folder):
 
 
 def index(folder):
-    return file_of(folder / INDEX, lambda path: Index.read(path.parent))
+    """A reader of indices, and of all that their tables say of contacts."""
+
+    def read(path):
+        contacts = Index.read(path.parent).contacts
+        return [(key, contacts.entries(i)) for i, key in enumerate(contacts)]
+
+    return file_of(folder / INDEX, read)
+
+
+def without_checksum(path):
+    """An index without a checksum is read as that of an earlier version."""
+    tree = json.loads(path.read_text())
+    del tree["crc32"]
+    return json.dumps(tree).encode()
 
 
 def weights(path):
@@ -141,21 +161,21 @@ def parsers(tmp_path_factory):
     described = [{"name": n, "dtype": a.dtype.str, "shape": a.shape} for n, a in frame.items()]
     header = json.dumps({"number": 1, "stamp_ns": 5, "arrays": described}).encode()
     tensors = {"a.weight": np.ones((2, 3), np.float32), "b": np.zeros(4, jnp.bfloat16)}
-    published = json.dumps(PUBLISHED).encode()
+    configuration = file_of(folder / "checkpoint" / CONFIG_FILE, lambda path: read_config(path.parent))
+    message = {**pushed([0, 0, -1], [0, 0, 0]), "InitializeProgress": np.array([[100.0]])}
     poses = {"timestamps": [0.0, 0.5], "poses": np.eye(3), "n": np.float64(2)}
     fakes.write(folder / "records", 2)
-    tree = json.loads((folder / "records" / INDEX).read_text())
-    del tree["crc32"]  # without one, an index is read as that of an earlier version
-    (folder / "index").mkdir()
+    shutil.copytree(folder / "records", folder / "index")  # the tables that the mutated root states
     (folder / "checkpoint").mkdir()
     return {
-        "Tac3D": (tac3d, SEPARATOR.join(datagrams(pushed([0, 0, -1], [0, 0, 0]))), UserError),
+        "Tac3D": (tac3d, SEPARATOR.join(datagrams(message)), UserError),
         "Net F/T": (netft.parse_calibration, NEWTONS, UserError),
         "bridge": (bridge_frame, header + SEPARATOR + b"".join(a.tobytes() for a in frame.values()), UserError),
         "sequence": (entry(decode_sequence), encode_sequence(fakes.sequence(length=3))[8:], UserError),
         "card": (entry(decode_card), encode_card(fakes.card())[8:], UserError),
         "journal": (journal(folder), recording(), UserError),
-        "index": (index(folder / "index"), json.dumps(tree).encode(), UserError),
+        "index": (index(folder / "index"), without_checksum(folder / "records" / INDEX), UserError),
+        "index of version 2": (index(folder / "index"), without_checksum(VERSION_2), UserError),
         "npz": (file_of(folder / "a.npz", load_arrays), arrays.getvalue(), UserError),
         "npy": (file_of(folder / "a.npy", load_arrays), array.getvalue(), UserError),
         "calibration": (file_of(folder / "c.npz", Calibration.load), calibration(folder), UserError),
@@ -165,11 +185,8 @@ def parsers(tmp_path_factory):
             written(folder, "b.safetensors", lambda path: safetensors.write_file(path, tensors)),
             ValueError,
         ),
-        "configuration": (
-            file_of(folder / "checkpoint" / qwen_config.CONFIG_FILE, lambda path: qwen_config.read_config(path.parent)),
-            published,
-            ValueError,
-        ),
+        "configuration": (configuration, json.dumps(PUBLISHED).encode(), ValueError),
+        "Qwen3 configuration": (configuration, json.dumps(qwen3_json(SHAPES[0])).encode(), ValueError),
         "tokenizer": (
             file_of(folder / "tokenizer.json", tokenizer.from_file),
             written(folder, "t.json", lambda path: trained_bpe(TOUCH_LANGUAGE).save(str(path))),
@@ -183,7 +200,7 @@ def parsers(tmp_path_factory):
 def test_a_parser_answers_any_bytes_by_a_value_or_a_documented_error(parsers, name):
     parse, data, documented = parsers[name]
     parse(data)
-    shaped = name in ("index", "configuration", "tokenizer")
+    shaped = name in ("index", "configuration", "tokenizer", "index of version 2", "Qwen3 configuration")
     check_parser(name, NAMES.index(name), parse, data, documented, shaped=shaped)
 
 

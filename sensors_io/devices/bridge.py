@@ -89,7 +89,11 @@ def unpack(header: bytes, payload: bytes) -> tuple[Mapping[str, Any], dict[str, 
             count = int(np.prod(shape))
             arrays[str(entry["name"])] = np.frombuffer(payload, dtype, count, start).reshape(shape)
             start += count * dtype.itemsize
-        int(described["number"] or 0), int(described["stamp_ns"])
+        number, stamp_ns = described["number"], int(described["stamp_ns"])
+        if number is not None:
+            described["number"] = number = int(number)
+        if max(abs(number or 0), abs(stamp_ns)) >= 1 << 63:
+            raise ValueError(f"number {number} or stamp_ns {stamp_ns} does not fit 64 bits")
     except MALFORMED as error:
         raise DeviceDataError(f"bridge frame cannot be read ({error}); use the server of this version") from error
     if start != len(payload):
@@ -183,7 +187,7 @@ class Bridge:
             self._selector.register(pipe, selectors.EVENT_READ)
         try:
             self._first = self.read(c.wait_s)
-        except (DeviceTimeoutError, DeviceLostError) as error:
+        except (DeviceTimeoutError, DeviceLostError, DeviceDataError) as error:
             self._close()
             raise DeviceNotFoundError(f"{c.sensor} {c.serial or '(any)'} gave no frame: {error}") from error
         return self

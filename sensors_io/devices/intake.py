@@ -23,6 +23,8 @@ from sensors_io.devices.base import Identity, Sample
 from sensors_io.devices.errors import DeviceError, DeviceTimeoutError, OverloadWarning, StaleFrameError
 from sensors_io.sync import ClockMap, CounterStep, IndexGaps, PeriodGaps
 
+_CLOCK_SET_NS = 10 * NS_PER_S  # between two clocks since the last sample: no buffer holds one back for so long
+
 
 @dataclasses.dataclass(kw_only=True)
 class Counts:
@@ -87,6 +89,7 @@ class Intake:
         self._clock_map = ClockMap()
         self._index_gaps = IndexGaps()
         self._period_gaps: PeriodGaps | None = None
+        self._stamps: tuple[int, int] | None = None  # of the last sample, on the device's clock and on the host's
         self._away = False
         self._broken_since = 0  # the last whole sample
         self._warned_at = 0
@@ -259,11 +262,21 @@ class Intake:
             by_index = self._index_gaps.step(sample.index, reopened=self._away)
         if self._period_gaps is None or by_index.duplicate or by_index.late:
             return by_index if sample.index is not None else CounterStep()
-        stamp = sample.host_time_ns if sample.device_time_ns is None else sample.device_time_ns
-        by_period = self._period_gaps.step(stamp)
+        by_period = self._by_period(self._period_gaps, sample)
         if not by_index.restarted:
             return by_index
         return dataclasses.replace(by_period, restarted=sample.index is not None)
+
+    def _by_period(self, gaps: PeriodGaps, sample: Sample) -> CounterStep:
+        """By the stamps, whose steps over a clock that was set, or began anew, are those of the host's."""
+        host = sample.host_time_ns
+        stamp = host if sample.device_time_ns is None else sample.device_time_ns
+        last, self._stamps = self._stamps, (stamp, host)
+        if last is not None:
+            moved = (stamp - last[0]) - (host - last[1])
+            if stamp < last[0] or abs(moved) > _CLOCK_SET_NS:
+                gaps.shift(moved)
+        return gaps.step(stamp)
 
     def _same_picture(self, sample: Sample) -> bool:
         """True if a picture without a counter repeats the last one: sensor noise never repeats itself."""

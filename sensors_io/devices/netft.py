@@ -10,6 +10,7 @@ unit of force, unit of torque, counts per unit of force, counts per unit of torq
 import contextlib
 import dataclasses
 import enum
+import math
 import socket
 import struct
 import time
@@ -96,8 +97,8 @@ class NetFtConfig:
     wait_s: float = 2.0
 
     def __post_init__(self) -> None:
-        if self.rate_hz <= 0:
-            raise ValueError(f"rate_hz is {self.rate_hz}: must be > 0; see the sensor's communication page")
+        if not 0 < self.rate_hz < math.inf:
+            raise ValueError(f"rate_hz is {self.rate_hz}: must be > 0 and finite; see the sensor's communication page")
 
     def open(self) -> "NetFt":
         """The device, not open yet."""
@@ -139,23 +140,26 @@ class _RateCheck:
 
     def __init__(self, rate_hz: float):
         self._rate_hz = rate_hz
-        self._first: tuple[int, int] | None = None  # number and arrival
+        self._first_ns: int | None = None
+        self._number = self._records = 0  # the last number, and how far it lies behind the first
         self._least: int | None = None
         self._until_ns = 0
         self.measured_hz: float | None = None
 
     def step(self, number: int, arrival_ns: int) -> None:
         """Take a record into account; `measured_hz` is set once the rate is seen to be wrong."""
-        if self._first is None:
-            self._first, self._until_ns = (number, arrival_ns), arrival_ns + self._EVERY_NS
+        if self._first_ns is None:
+            self._first_ns, self._number, self._until_ns = arrival_ns, number, arrival_ns + self._EVERY_NS
             return
-        records, elapsed_ns = (number - self._first[0]) % 2**32, arrival_ns - self._first[1]
-        late_ns = elapsed_ns - round(records * NS_PER_S / self._rate_hz)
+        self._records += (number - self._number + 2**31) % 2**32 - 2**31  # one may overtake another; numbers run around
+        self._number = number
+        elapsed_ns = arrival_ns - self._first_ns
+        late_ns = elapsed_ns - round(self._records * NS_PER_S / self._rate_hz)
         self._least = late_ns if self._least is None else min(self._least, late_ns)
         if arrival_ns < self._until_ns:
             return
         if abs(self._least) > self._ALLOWED_NS + self._DRIFT * elapsed_ns:
-            self.measured_hz = records * NS_PER_S / elapsed_ns
+            self.measured_hz = self._records * NS_PER_S / elapsed_ns
         self._least, self._until_ns = None, arrival_ns + self._EVERY_NS
 
 

@@ -108,7 +108,7 @@ class Pump:
             self._clock.sleep_until(self._clock.now_ns() + round(wait_s * NS_PER_S), self._stop)
             try:
                 self.open()
-            except (DeviceNotFoundError, DeviceLostError, DeviceTimeoutError) as absent:
+            except (DeviceNotFoundError, DeviceLostError, DeviceTimeoutError, DeviceDataError) as absent:
                 tried_s = (self._clock.now_ns() - began_ns) / NS_PER_S
                 if tried_s > self._config.give_up_after_s:
                     self._intake.fail(DeviceLostError(f"given up after {tried_s:.0f} s: {absent}"))

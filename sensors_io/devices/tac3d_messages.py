@@ -12,6 +12,7 @@ schema's x right, y down.  Nothing is mirrored: the components of vectors stay a
 
 import collections
 import dataclasses
+import math
 import pathlib
 import re
 import struct
@@ -28,6 +29,7 @@ GRID = 20
 
 _PACKET = struct.Struct("=IHH")
 _MAX_PACKETS = 1024  # of one message: 64 MB, far above the 50 kB that a sensor sends
+_LARGEST = _MAX_PACKETS << 16  # bytes of a message, and so numbers along a side of an array, though another side be 0
 _IN_FLIGHT = 8  # messages whose packets may come interleaved
 _CACHED_LAYOUTS = 16
 
@@ -100,6 +102,9 @@ class Tac3dDecoder:
                     f"Tac3D array {item.name} ends at byte {item.end} of {len(data)}: data are cut off"
                 )
             matrices[item.name] = np.frombuffer(data, item.dtype, item.count, item.offset).reshape(item.shape)
+        started = matrices.get("InitializeProgress", np.array(100)).ravel()[:1]
+        if not len(started) or not np.isfinite(started[0]):
+            raise DeviceDataError(f"Tac3D InitializeProgress is {started}: must be a percentage; look at its program")
         try:
             send_time_s = float(scalars[b"timestamp"])
             index = int(scalars[b"index"])
@@ -155,8 +160,9 @@ def _item(pairs: Mapping[str, str]) -> _Item | None:
         name, offset, length = pairs["name"], int(pairs["offset"]), int(pairs["length"])
     except (KeyError, ValueError) as error:
         raise DeviceDataError(f"Tac3D layout item {dict(pairs)} cannot be read ({error!r})") from error
-    count = int(np.prod(shape)) if shape else 1
-    if min(offset, *shape, 0) < 0 or count * dtype.itemsize != length:
+    count = math.prod(shape)
+    sizes = (offset, *shape)
+    if min(sizes) < 0 or max(sizes) > _LARGEST or count * dtype.itemsize != length:
         raise DeviceDataError(f"Tac3D layout item {name}: {shape} of {dtype} are not {length} bytes at {offset}")
     return _Item(name, dtype, shape, count, offset, offset + length)
 

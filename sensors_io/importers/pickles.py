@@ -12,6 +12,7 @@ import pathlib
 import pickle
 import pickletools
 import re
+import reprlib
 import tokenize
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -37,14 +38,16 @@ class _DType:
 
     def __init__(self, name: str, align: object = False, copy: object = True):
         if name not in ("O", "O8") and not (isinstance(name, str) and _SIMPLE.fullmatch(name)):
-            raise PickleError(f"asks for an array of type {name!r}: only numbers, text and lists of them are read")
+            raise PickleError(
+                f"asks for an array of type {reprlib.repr(name)}: only numbers, text and lists of them are read"
+            )
         self.objects = name in ("O", "O8")
         self.dtype = np.dtype(object if self.objects else name)
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         order = state[1] if isinstance(state, tuple) and len(state) >= 5 else None
         if order not in ("<", ">", "|", "=") or any(part is not None for part in state[2:5]):
-            raise PickleError(f"asks for an array of a structured type, {state!r}: split its fields")
+            raise PickleError(f"asks for an array of a structured type, {reprlib.repr(state)}: split its fields")
         self.dtype = self.dtype.newbyteorder(order)
 
 
@@ -64,7 +67,7 @@ def _array(data: Any, kind: Any, shape: Any, order: Any) -> np.ndarray:
     shape = (shape,) if isinstance(shape, int) else shape
     ok = isinstance(shape, tuple) and len(shape) <= 32 and all(type(n) is int and n >= 0 for n in shape)
     if not ok or not isinstance(kind, _DType) or order not in ("C", "F"):
-        raise PickleError(f"asks for an array of shape {shape!r}: must be a tuple of sizes, with a type")
+        raise PickleError(f"asks for an array of shape {reprlib.repr(shape)}: must be a tuple of sizes, with a type")
     if kind.objects:
         if not isinstance(data, list) or len(data) != math.prod(shape):
             raise PickleError(f"an array of objects of shape {shape} must hold as many")
@@ -88,7 +91,7 @@ def _scalar(kind: Any, data: Any) -> Any:
 def _latin1(text: str, encoding: str) -> bytes:
     """Bytes as protocols 0 to 2 spell them."""
     if encoding != "latin1":
-        raise PickleError(f"spells bytes in {encoding!r}: must be latin1")
+        raise PickleError(f"spells bytes in {reprlib.repr(encoding)}: must be latin1")
     return text.encode("latin1")
 
 
@@ -166,25 +169,40 @@ def _load(stream: io.BytesIO) -> Any:
         if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT") and int(argument or 0) > operations:
             raise pickle.UnpicklingError(f"object {argument} is remembered after {operations} operations")
     stream.seek(start)
-    return _plain(_DataUnpickler(stream).load(), _DEPTH)
+    return _plain(_DataUnpickler(stream).load(), _DEPTH, {})
 
 
-def _plain(data: Any, depth: int) -> Any:
+def _plain(data: Any, depth: int, done: dict[int, tuple[Any, Any]]) -> Any:
+    """Data with arrays for their stand-ins.
+
+    Args:
+      data: as it was unpickled.
+      depth: of lists and dictionaries that is left.
+      done: identity → lists and dictionaries that were seen, and what became of each: a pickle of a few hundred bytes
+        names one of them twice in another, and that one twice in the next, 2⁶⁰ times in all.
+    """
     if not depth:
         raise PickleError(f"nests its data more than {_DEPTH} deep: must be flatter")
+    if id(data) in done:
+        return done[id(data)][1]
+    plain = lambda part: _plain(part, depth - 1, done)
+    found: Any
     if isinstance(data, _Array):
         if data.value is None:
             raise pickle.UnpicklingError("an array without its data")
         if data.value.dtype == object:
             for i, item in enumerate(data.value.flat):
-                data.value.flat[i] = _plain(item, depth - 1)
-        return data.value
-    if isinstance(data, _DType):
+                data.value.flat[i] = plain(item)
+        found = data.value
+    elif isinstance(data, _DType):
         return data.dtype
-    if isinstance(data, dict):
-        return {_plain(k, depth - 1): _plain(v, depth - 1) for k, v in data.items()}
-    if isinstance(data, list | tuple | set | frozenset):
-        return type(data)(_plain(v, depth - 1) for v in data)
-    if isinstance(data, type) or callable(data):
+    elif isinstance(data, dict):
+        found = {plain(k): plain(v) for k, v in data.items()}
+    elif isinstance(data, list | tuple | set | frozenset):
+        found = type(data)(plain(v) for v in data)
+    elif isinstance(data, type) or callable(data):
         raise PickleError(f"holds the name {data!r} as data: only numbers, text and arrays are read")
-    return data
+    else:
+        return data
+    done[id(data)] = data, found
+    return found

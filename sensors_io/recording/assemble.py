@@ -224,12 +224,12 @@ class _Force:
         time, force, moment, beyond = (
             np.concatenate([b[name] for b in batches]) for name in ("time_ns", "force_n", "moment_nmm", "out_of_range")
         )
-        order = np.flatnonzero(np.diff(time, prepend=time[0] - 1) > 0)
+        time, order = np.unique(time, return_index=True)  # records of a datagram that was held up overlap the next
         try:
-            found = at_frames(time_ns, time[order], np.concatenate([force, moment], -1)[order].astype(np.float64))
+            found = at_frames(time_ns, time, np.concatenate([force, moment], -1)[order].astype(np.float64))
         except ForceError:  # killed before three readings: no force, and every frame says so
             return cls(arrays={}, uncovered=~nowhere, out_of_range=nowhere, residual_n=None)
-        after = np.clip(np.searchsorted(time[order], time_ns), 1, len(order) - 1)
+        after = np.clip(np.searchsorted(time, time_ns), 1, len(time) - 1)
         values = found.value.astype(np.float32)
         return cls(
             arrays={"force_n": values[:, :3], "moment_nmm": values[:, 3:], "force_time_ns": found.time_ns},

@@ -1,6 +1,7 @@
 """The records of a session and the journals beside them: what is done, what is wanted next, what a kill left behind."""
 
 import dataclasses
+import itertools
 import pathlib
 from typing import Any
 
@@ -94,7 +95,9 @@ class Book:
         try:
             return self._store(path)
         except SchemaError as error:  # set aside, or it would stop every later session
-            kept = path.rename(path.with_suffix(".refused"))
+            numbers = itertools.chain([""], (f".{n}" for n in itertools.count(2)))  # an earlier attempt's stays
+            names = (path.with_suffix(f"{number}.refused") for number in numbers)
+            kept = path.rename(next(name for name in names if not name.exists()))
             raise SchemaError(f"{error}; nothing is lost: the contact's journal is kept as {kept}") from error
 
     def _store(self, path: pathlib.Path) -> bool | None:

@@ -11,6 +11,7 @@ import dataclasses
 import json
 import os
 import pathlib
+import re
 import struct
 import time
 import zlib
@@ -112,9 +113,11 @@ def _entries(path: pathlib.Path, data: memoryview) -> Iterator[tuple[JournalEntr
         magic, size, checksum = _PREFIX.unpack_from(data, start)
         end = start + _PREFIX.size + size
         body = data[start + _PREFIX.size : end]
-        if magic != _MAGIC or (end <= len(data) and zlib.crc32(body) != checksum):
+        torn = end > len(data)
+        whole = zlib.crc32(body) == checksum
+        if magic != _MAGIC or torn == whole or (torn and _goes_on(data[start + len(_MAGIC) :])):
             raise JournalError(f"{path} is damaged at byte {start}: move it away, its contact has to be recorded again")
-        if end > len(data):
+        if torn:
             return
         try:
             entry = _decode(body)
@@ -125,6 +128,17 @@ def _entries(path: pathlib.Path, data: memoryview) -> Iterator[tuple[JournalEntr
             ) from error
         yield entry, end
         start = end
+
+
+def _goes_on(rest: memoryview) -> bool:
+    """True if a whole entry lies behind one that seems cut off: its size is damaged, and nothing was cut off."""
+    for match in re.finditer(re.escape(_MAGIC), rest):
+        if match.start() + _PREFIX.size <= len(rest):
+            _, size, checksum = _PREFIX.unpack_from(rest, match.start())
+            body = rest[match.start() + _PREFIX.size :][:size]
+            if len(body) == size and zlib.crc32(body) == checksum:
+                return True
+    return False
 
 
 def _decode(body: memoryview) -> JournalEntry:

@@ -16,6 +16,7 @@ from array_record.python.array_record_module import ArrayRecordReader, ArrayReco
 
 from sensors_io import records, tables
 from sensors_io.__main__ import main
+from sensors_io.codec import CorruptRecordsError
 from sensors_io.index import Index
 from sensors_io.records import RecordsError, RecordStore, RecordWriter
 from sensors_io.schema import SENSORS, SchemaError
@@ -217,6 +218,13 @@ def shard(change):
 def test_damage_is_named(path, damage, said):
     damage(path)
     refused(records.RecordsError, said, lambda: [RecordStore(path).contact(i) for i in range(2)])
+
+
+def test_contacts_of_objects_that_no_table_names_are_not_left_out(tmp_path):
+    found = Index.read(fakes.write(tmp_path / "data", 2))
+    for objects, motions in (([], found.meta.sensors), (found.objects, ())):
+        table = tables.ContactTable(found.contacts.rows, objects, found.meta.sensors, motions)
+        refused(CorruptRecordsError, "contact 0 is of object 0 of", list, table)
 
 
 def test_every_flipped_bit_of_the_index_is_found(tmp_path):

@@ -132,7 +132,9 @@ def test_curves_are_sorted_by_phase_arm_and_seed():
 
 
 def test_running_mean_is_over_a_twentieth_of_the_points():
+    """Of 40 points three, and of those at the ends the two that there are."""
     assert running_mean(np.eye(100)[50])[47:54].tolist() == pytest.approx([0, 0.2, 0.2, 0.2, 0.2, 0.2, 0])
+    assert running_mean(np.arange(40.0)).tolist() == pytest.approx([0.5, *range(1, 39), 38.5])
 
 
 @pytest.mark.long

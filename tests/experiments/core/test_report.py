@@ -166,6 +166,16 @@ def test_bold_needs_a_paired_interval_without_zero(results):
         assert not is_best("acc", "paid", dataclasses.replace(results, comparisons=doubtful))
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "bold"), [(-1, 9, False), (0, 9, False), (-9, 0, False), (1, 9, True), (-9, -1, True)]
+)
+def test_a_difference_is_bold_where_its_interval_excludes_zero(tmp_path, results, low, high, bold):
+    page = write(tmp_path, dataclasses.replace(results, comparisons=(compared("acc", "paid", "unpaid", low, high),)))
+    shown = bounds(low, high, "+" + METRICS["acc"].format)
+    assert f">{shown}<" in page
+    assert (f"<b>{shown}</b>" in page) == bold
+
+
 def test_a_run_without_curves_rollouts_or_middle_rate_has_no_such_sections(tmp_path):
     arms = {"a": {"acc": Estimate(mean=1.0, ci95=(0.0, 2.0), per_seed=(1.0,))}}
     bare = Results(arms=arms, baselines={}, settings={"preset": "paper", "lr_scale": 1.0})

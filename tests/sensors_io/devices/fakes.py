@@ -31,8 +31,8 @@ class Ramp:
 class Scripted:
     """A device whose reads come from a list: samples, or exceptions that are raised; absent for `refusals` openings."""
 
-    def __init__(self, script, *, refusals=0, period_s=None):
-        self.script, self.refusals, self.period_s = list(script), refusals, period_s
+    def __init__(self, script, *, refusals=0, period_s=None, refusal=DeviceNotFoundError):
+        self.script, self.refusals, self.period_s, self.refusal = list(script), refusals, period_s, refusal
         self.opened = self.closed = 0
 
     @property
@@ -42,7 +42,7 @@ class Scripted:
     def __enter__(self):
         if self.opened and self.refusals:
             self.refusals -= 1
-            raise DeviceNotFoundError("scripted: absent")
+            raise self.refusal("scripted: absent")
         self.opened += 1
         return self
 

@@ -28,6 +28,8 @@ def test_a_failing_sdk_says_its_last_words(monkeypatch, request):
     monkeypatch.chdir(request.config.rootpath)
     with pytest.raises(DeviceNotFoundError, match="no such sensor"), config("fails").open():
         pass
+    with pytest.raises(DeviceNotFoundError, match=r"gave no frame: .* of type object"), config("objects").open():
+        pass
     with pytest.raises(DeviceNotFoundError, match="does not start"), bridge.BridgeConfig(python="/nowhere").open():
         pass
     refused(DeviceLostError, "not open", lambda: config("3").open().read(0.1))
@@ -41,6 +43,9 @@ def test_damaged_frames_are_refused():
     refused(DeviceDataError, "1 bytes of arrays", lambda: bridge.unpack(header(), b"x"))
     refused(DeviceDataError, "of type object", lambda: bridge.unpack(kind("O", 1), b"x" * 8))
     refused(DeviceDataError, "cannot be read", lambda: bridge.unpack(kind("<f8", 9), b"x" * 8))
+    for number, stamp_ns in ((10**30, 2), (1, -(10**30)), ("x", 2)):
+        far = json.dumps({"number": number, "stamp_ns": stamp_ns, "arrays": []}).encode()
+        refused(DeviceDataError, "cannot be read", bridge.unpack, far, b"")
 
 
 XENSESDK = '''

@@ -33,6 +33,8 @@ def message(arrays=FINE, **rest):
         message(index=10**30),
         message({**FINE, "3D_Displacements": np.zeros((399, 3))}),
         message({**FINE, "3D_ResultantForce": np.zeros((2, 2))}),
+        message({**FINE, "InitializeProgress": np.array([[np.nan]])}),
+        message({**FINE, "InitializeProgress": np.zeros((0, 1))}),
         lambda number: [b"\0" * 3],
     ],
 )
@@ -78,6 +80,22 @@ def test_a_repeated_replay_keeps_the_gaps_of_the_recording(tmp_path):
     np.savez(tmp_path / "a.npz", index=[3, 4, 7], sendTimestamp=[0.0, 0.03, 0.12])
     with Replay(Tac3dRecording(path=tmp_path / "a.npz"), seconds=0.4, clock=JumpingClock()) as device:
         assert [device.read(1.0).index for _ in range(6)] == [3, 4, 7, 8, 9, 12]
+
+
+def test_a_record_that_another_overtook_is_no_wrong_rate():
+    class OnTime(list):
+        """The record of each moment, 1,000 a second, the first two in the wrong order."""
+
+        def __iter__(self):
+            began = time.monotonic()
+            for k in super().__iter__():
+                yield record(6 - k if k < 2 else 6 + round(1000 * (time.monotonic() - began)), *[0] * 6)
+                time.sleep(0.005)
+
+    with sensor(OnTime(range(80))) as (config, _), config.open() as device:
+        stamps = [device.read(5.0).device_time_ns for _ in range(80)]
+    assert stamps[:2] == [6_000_000, 5_000_000]
+    assert None not in stamps
 
 
 def test_a_wrong_rate_of_a_force_sensor_warns_and_leaves_its_stamps_out():

@@ -105,4 +105,5 @@ def test_an_absent_sensor_is_named():
     with pytest.raises(DeviceNotFoundError, match="does not answer"), config.open():
         pass
     refused(DeviceLostError, "not open", lambda: config.open().read(0.1))
-    refused(ValueError, "rate_hz is 0", NetFtConfig, rate_hz=0)
+    for rate_hz in (0, float("nan"), float("inf")):
+        refused(ValueError, f"rate_hz is {rate_hz}", NetFtConfig, rate_hz=rate_hz)

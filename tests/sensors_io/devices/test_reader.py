@@ -100,8 +100,10 @@ def test_without_a_counter_the_same_picture_is_a_duplicate_and_the_period_tells_
     assert len(drain(intake)) == 4
 
 
-def test_a_lost_device_is_opened_again_with_growing_waits():
-    device = Scripted([sample(0), DeviceLostError("unplugged"), sample(7), sample(8)], refusals=4)
+@pytest.mark.parametrize("refusal", [DeviceNotFoundError, DeviceDataError], ids=["absent", "still starting"])
+def test_a_lost_device_is_opened_again_with_growing_waits(refusal):
+    script = [sample(0), DeviceLostError("unplugged"), sample(7), sample(8)]
+    device = Scripted(script, refusals=4, refusal=refusal)
     clock = JumpingClock()
     counts = pumped(device, clock=clock, first_wait_s=0.1, longest_wait_s=0.4).counts
     assert clock.now_ns() == 1500 * MS  # 0.1 + 0.2 + 0.4 + 0.4 + 0.4
@@ -136,10 +138,26 @@ def test_a_silent_device_is_taken_as_lost():
     assert (counts.timeouts, counts.disconnects, counts.reconnects) == (3, 1, 1)
 
 
-def test_a_counter_that_restarts_on_reconnecting_leaves_the_loss_to_the_clock():
-    script = [sample(4, 40), sample(5, 50), DeviceLostError("x"), sample(0, 110), sample(1, 120)]
+@pytest.mark.parametrize("stamps", [(None, None, None, None), (40, 50, 0, 10)], ids=["host's", "device's"])
+def test_a_counter_that_restarts_on_reconnecting_leaves_the_loss_to_the_clock(stamps):
+    """That of the host where the device's began anew too."""
+    script = [
+        sample(index, time_ms, device_time_ns=stamp if stamp is None else stamp * MS)
+        for (index, time_ms), stamp in zip([(4, 40), (5, 50), (0, 110), (1, 120)], stamps, strict=True)
+    ]
+    script.insert(2, DeviceLostError("x"))
     counts = pumped(Scripted(script, period_s=0.01)).counts
     assert (counts.restarts, counts.missing, counts.missing_away) == (1, 5, 5)
+
+
+@pytest.mark.parametrize("set_by_s", [-3600, 3600])
+def test_a_clock_that_is_set_during_a_recording_loses_and_moves_nothing(set_by_s):
+    """Samples 3 and 4 are lost while the device's clock is set by an hour."""
+    times = [0, 10, 20, 50, 60, 70]
+    script = [sample(None, t, device_time_ns=(t + (1000 * set_by_s if t > 20 else 0)) * MS) for t in times]
+    intake = pumped(Scripted(script, period_s=0.01))
+    assert (intake.counts.missing, intake.counts.lost) == (2, 2)
+    assert [s.host_time_ns for s in drain(intake)] == [t * MS for t in times]
 
 
 def test_device_stamps_are_mapped_to_the_hosts_clock():

@@ -86,6 +86,12 @@ def test_damaged_datagrams_are_refused():
 GOOD = layout({"3D_ResultantForce": np.ones((1, 3))})
 
 
+def empty(height, width):
+    """The layout with an array that is said to be of these sides and of no bytes."""
+    sides = GOOD.replace(b"height: 1", b"height: %d" % height).replace(b"width: 3", b"width: %d" % width)
+    return sides.replace(b"length: 24", b"length: 0")
+
+
 @pytest.mark.parametrize(
     ("bad", "data", "message"),
     [
@@ -95,6 +101,8 @@ GOOD = layout({"3D_ResultantForce": np.ones((1, 3))})
         (GOOD.replace(b"height: 1", b"height: 7"), b"\0" * 24, "are not 24 bytes"),
         (GOOD.replace(b"offset: 0", b"offset: -8"), b"\0" * 24, "are not 24 bytes at -8"),
         (GOOD.replace(b"width: 3", b"width: x"), b"\0" * 24, "cannot be read"),
+        (empty(2**32, 2**32), b"", "are not 0 bytes"),  # whose product is 0 in 64 bits
+        (empty(0, 10**30), b"", "are not 0 bytes"),
         (GOOD.replace(b"index: 10", b"index: ten"), b"\0" * 24, "lacks a readable index"),
         (b"index: 1\nSN: x\ntimestamp: 2\ndata:\n", b"", "lists no array"),
         (b"index: 1\nSN: x\ntimestamp: 2\ndata: \xff\n", b"", "lists no array"),

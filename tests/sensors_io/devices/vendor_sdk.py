@@ -6,10 +6,13 @@ import numpy as np
 
 
 def frames(serial):
-    """Three frames, or as many as the serial says; one that says "fails" raises."""
+    """Three frames, or as many as the serial says; "fails" raises, and of "objects" no reader takes any."""
     print("vendor banner on standard output", flush=True)  # noqa: T201
     if serial == "fails":
         raise RuntimeError("no such sensor")
+    if serial == "objects":
+        yield time.monotonic_ns(), 0, {"a": np.array([None])}
+        return
     for n in range(int(serial or 3)):
         picture = np.full((2, 3, 3), n, np.uint8)
         picture[..., 2] = 200  # red, in the SDK's BGR

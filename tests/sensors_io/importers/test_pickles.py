@@ -1,5 +1,6 @@
 """Pickles are read as data and never run."""
 
+import functools
 import os
 import pickle
 
@@ -54,6 +55,10 @@ TYPE = (np.dtype, ("f8", False, True))
         (state(EMPTY, 1, (2,), np.dtype(object), False, [1]), "must hold as many"),
         (state(EMPTY, 1, (1 << 40,), np.dtype("f8"), False, b"\0" * 8), "must have 8796093022208 bytes"),
         (state(EMPTY, 1, (-1,), np.dtype("f8"), False, b""), "tuple of sizes"),
+        (
+            state(EMPTY, 1, functools.reduce(lambda t, _: (t, t), range(60), ()), np.dtype("f8"), False, b""),
+            "tuple of sizes",
+        ),
         (state(TYPE, 3, "<", None, ("a",), {"a": (np.dtype("f8"), 99)}, 8, 8, 0), "structured"),
         (pickle.dumps(np.zeros(1, [("a", object)])), "V8"),
         (pickle.dumps([0])[:-1] + b"r\xff\xff\xff\x7f.", "remembered"),
@@ -64,6 +69,16 @@ TYPE = (np.dtype, ("f8", False, True))
 def test_crafted_pickles_are_refused_before_memory_is_touched(tmp_path, data, message):
     (tmp_path / "a.pkl").write_bytes(data)
     refused(PickleError, message, read_pickle, tmp_path / "a.pkl")
+
+
+def test_what_a_pickle_names_again_and_again_is_read_once(tmp_path):
+    """A list of twice the same list, fifty times: 2⁵⁰ copies of the innermost."""
+    innermost = [np.arange(3)]
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(functools.reduce(lambda part, _: [part, part], range(50), innermost)))
+    found = read_pickle(tmp_path / "a.pkl")
+    for _ in range(51):
+        found = found[-1]
+    assert found.tolist() == [0, 1, 2]
 
 
 def test_arrays_of_every_order_and_type_come_back(tmp_path):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import pathlib
+import re
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from sensors_io.recording.session import record_session
 from sensors_io.records import CorruptRecordsError, RecordStore
 from sensors_io.schema import Flag, SchemaError
 from tests.sensors_io.checks import refused
-from tests.sensors_io.recording.hand import Camera, Hand, Scale, Skin
+from tests.sensors_io.recording.hand import MS, Camera, Hand, Scale, Skin
 from tests.sensors_io.recording.test_session import CONFIG, SHORT
 
 FREE = dataclasses.replace(CONFIG, free_s=0.5)
@@ -69,13 +70,15 @@ def test_samples_of_another_shape_are_left_out_and_counted(tmp_path):
 
 
 def test_a_contact_that_cannot_be_stored_keeps_its_journal_and_later_sessions_go_on(tmp_path, monkeypatch):
-    hand = Hand()
     refuse = lambda writer, sequences: (_ for _ in ()).throw(SchemaError("frames is None: refused for the test"))
+    kept = ["cup-0-press-0.refused", "cup-0-press-0.2.refused", "cup-0-press-0.3.refused"]
     with monkeypatch.context() as patched:
         patched.setattr("sensors_io.records.RecordWriter.write_contact", refuse)
-        with pytest.raises(SchemaError, match=r"nothing is lost: .*cup-0-press-0\.refused"):
-            record_session(tmp_path, SHORT, [Camera(hand)], Scale(hand), show=hand.show)
-    assert [p.name for p in (tmp_path / ".journals").iterdir()] == ["cup-0-press-0.refused"]
+        for name in kept:
+            hand = Hand()
+            with pytest.raises(SchemaError, match=f"nothing is lost: .*{re.escape(name)}"):
+                record_session(tmp_path, SHORT, [Camera(hand)], Scale(hand), show=hand.show)
+    assert sorted(p.name for p in (tmp_path / ".journals").iterdir()) == sorted(kept)
     hand = Hand()
     assert record_session(tmp_path, SHORT, [Camera(hand)], Scale(hand), show=hand.show).contacts == 2
 
@@ -98,6 +101,22 @@ class Heavy(Scale):
     def drain(self):
         arrays = {"force_n": np.array([70.0, 0, 1.0], np.float32), "moment_nmm": np.array([0, 600, 0], np.float32)}
         return [Sample(host_time_ns=s.host_time_ns, arrays=arrays) for s in super().drain()]
+
+
+class Overlapping(Scale):
+    """Records of a datagram that was held up are stamped before the last ones of the datagram ahead of it."""
+
+    def drain(self):
+        early_ns = 7 * MS if self.hand.time_ns == 10**9 + 200 * MS else 0
+        return [dataclasses.replace(s, host_time_ns=s.host_time_ns - early_ns) for s in super().drain()]
+
+
+def test_forces_whose_times_overlap_are_kept(tmp_path):
+    hand = Hand()
+    record_session(tmp_path, FREE, [Camera(hand)], Overlapping(hand), show=hand.show)
+    made = RecordStore(tmp_path).contact(0)["gelsight_mini"]
+    np.testing.assert_array_equal(made.force_n, np.zeros((len(made), 3)))
+    assert not made.flags.any()
 
 
 def test_stamps_past_64_bits_leave_the_device_clock_out(tmp_path):

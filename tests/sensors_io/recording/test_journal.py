@@ -34,11 +34,14 @@ def test_every_cut_keeps_all_whole_entries(journal):
         assert torn == size % each
 
 
-def test_damage_inside_is_refused(journal):
+@pytest.mark.parametrize(("entry", "byte"), [(0, 0), (0, 30), (0, 7), (2, 7), (3, 7)])
+def test_damage_inside_is_refused(journal, entry, byte):
+    """Also of the size, by which the rest of the file would seem to be one entry that was cut off."""
     data = bytearray(journal.read_bytes())
-    data[30] ^= 1
+    start = entry * len(data) // 4
+    data[start + byte] ^= 64
     journal.write_bytes(data)
-    refused(JournalError, "damaged at byte 0", read_journal, journal)
+    refused(JournalError, f"damaged at byte {start}:", read_journal, journal)
 
 
 def test_a_journal_is_never_overwritten(journal):
