@@ -190,8 +190,8 @@ def choice_table(judgements: Sequence[DefaultJudgement]) -> Table:
     for j in judgements:
         for point in j.points:
             by = dominators(point.name, j.points) or ()
-            where = {"measured in": j.title, "run": j.run}
-            rows.append({"choice": point.name, **where, "dominated by": by[0].name if by else "–"})
+            found = by[0].name if by else "–"
+            rows.append({"choice": point.name, "measured in": j.title, "dominated by": found, "run": j.run})
     meanings = RUN_MEANING | {"dominated by": "no worse on any axis of that table, better on one"}
     return named_table("Choices", rows, meanings=meanings)
 
@@ -222,11 +222,11 @@ def default_table(judgements: Sequence[DefaultJudgement]) -> Table:
                 "default of": j.judged.what,
                 "what is used": j.judged.default,
                 "table": j.title,
-                "run": j.run,
                 "judged by": ", ".join(f"{column} ({better})" for column, better in j.judged.axes.items()),
                 "measured": len(j.points),
                 "on the front": len(front(j.points)),
                 "dominated by": "not measured" if j.dominated_by is None else _names(j.dominated_by) or "nothing",
+                "run": j.run,
             }
             for j in judgements
         ],

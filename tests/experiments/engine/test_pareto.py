@@ -66,14 +66,14 @@ def test_the_page_names_dominated_defaults_and_shows_the_charts(tmp_path):
     directory = run_shrunk(pareto, GatherConfig(others=tmp_path), tmp_path / "first")
     results = read_json(directory / "results.json")
     defaults, choices, _ = results["tables"]
-    of_run = [row for row in choices["rows"] if row[2] == "20260101-000000"]
-    assert {row[0]: row[-1] for row in of_run} == {"Winkler": "–", "nested 1e-3": "–", "plain": "nested 1e-3"}
-    assert defaults["rows"][0][3:] == ["20260101-000000", "time (lower), slope median (lower)", 3, 2, "nothing"]
+    of_run = [row for row in choices["rows"] if row[-1] == "20260101-000000"]
+    assert {row[0]: row[2] for row in of_run} == {"Winkler": "–", "nested 1e-3": "–", "plain": "nested 1e-3"}
+    assert defaults["rows"][0][4:] == [3, 2, "nothing", "20260101-000000"]
     assert "pareto_storage" in results["settings"]["neither run nor recorded"]
     assert (directory / "plots" / "pareto_contact-pareto_contact.svg").exists()
     finished(tmp_path, "20260102-000000", [*TABLE["rows"], ["new", 1.0, 0.01]])
     results = read_json(run_shrunk(pareto, GatherConfig(others=tmp_path), tmp_path / "second") / "results.json")
-    assert results["tables"][0]["rows"][0][-1] == "new"
+    assert results["tables"][0]["rows"][0][6:] == ["new", "20260102-000000"]
     assert not results["requirements"][0]["met"]
 
 
@@ -84,7 +84,7 @@ def test_recorded_results_stand_for_what_did_not_run_here(tmp_path):
     assert kept
     assert set(kept) <= set(recorded_names())
     assert all(row[1].startswith("recorded  default, code ") for row in runs["rows"])
-    assert {row[2] for row in choices["rows"]} == {row[3] for row in defaults["rows"]} == {"recorded"}
+    assert {row[-1] for row in (*choices["rows"], *defaults["rows"])} == {"recorded"}
     assert results["settings"]["recorded"] == ", ".join(kept)
     assert f"Not run here, so by the recorded result: {', '.join(kept)}." in results["verdict"]
 
