@@ -108,7 +108,7 @@ def test_the_page_is_well_formed_whole_and_loads_nothing(tmp_path, results):
     assert not re.search(r"https?://|@import|url\(", page)
     assert not {"script", "link", "iframe"} & reader.seen
     for text in (
-        "Does it?", "Being paid helps.", "paid", "unpaid", "blind", "preset paper", "lr_scale 100", "loss",
+        "Does it?", "Being paid helps.", "paid", "unpaid", "blind", "preset paper", "lr scale 100", "loss",
         "<th>sft</th><td>2</td><td>2.0</td><td>4.0</td>",
         "NOT MET", "≥ 400 records/s", "−2.00", "winkler", "–", "left is faster", "Fields of xense",
     ):  # fmt: skip
