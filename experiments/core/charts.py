@@ -40,6 +40,7 @@ ITERATIONS = 200
 """Of the placement of labels; a limit in seconds would make a picture depend on the machine."""
 
 STROKES, STROKE = ("|", "_", "x", "+"), 1.5  # markers without an area, width of their lines in points
+BEHIND = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}  # text, legible on lines that it crosses
 ROOM = 0.12  # for the figure at the end of the longest bar, over the length of the axis
 
 Values = Sequence[float] | np.ndarray  # numbers [N]
@@ -313,7 +314,7 @@ def _draw_bars(axes: Axes, panel: Panel) -> None:
             left = left + np.nan_to_num(series.x)
         if panel.written and (not panel.stacked or i == len(every) - 1):
             figures = [number(value, panel.written) for value in (left if panel.stacked else series.x)]
-            axes.bar_label(drawn, figures, padding=3, fontsize=8)
+            axes.bar_label(drawn, figures, padding=3, fontsize=8, bbox=BEHIND)
             axes.margins(x=ROOM)
 
 
@@ -386,7 +387,6 @@ def _entries(panels: Sequence[Panel]) -> dict[str, Line2D | Patch]:
 def _write_labels(axes: Axes, panel: Panel) -> None:
     texts, points = [], []
     line = {"arrowstyle": "-", "color": SHARED, "lw": 0.5}
-    behind = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}  # legible on lines that it crosses
     for series in panel.series:
         for i, (x, y) in enumerate(zip(series.x, series.y, strict=True)):
             if not np.isfinite((x, y)).all():
@@ -394,7 +394,7 @@ def _write_labels(axes: Axes, panel: Panel) -> None:
             points.append((x, y))
             if series.labels and series.labels[i]:
                 colour = series.colour if isinstance(series.colour, str) else SHARED
-                texts.append(axes.text(x, y, series.labels[i], fontsize=7.5, color=colour, bbox=behind))
+                texts.append(axes.text(x, y, series.labels[i], fontsize=7.5, color=colour, bbox=BEHIND))
     if texts:
         x, y = zip(*points, strict=True)
         adjust_text(texts, x, y, ax=axes, arrowprops=line, expand=(1.15, 1.5), iter_lim=ITERATIONS)
