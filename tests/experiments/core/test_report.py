@@ -176,6 +176,7 @@ def test_a_run_without_curves_rollouts_or_middle_rate_has_no_such_sections(tmp_p
 def test_figures_with_intervals_are_figures_and_a_missing_one_is_no_word():
     rows = [{"arm": "a", "gain": "+1.0 [−0.2, 2.1]", "p": 0.1, "why": None}, {"arm": "b", "gain": "–", "why": "noise"}]
     assert word_columns(named_table("", rows)) == [True, False, False, True]
+    assert word_columns(named_table("", [{"law": "fitted", "of": "0.1, " * 9}])) == [True, True]  # long
 
 
 def test_pairs_of_a_metric_are_together_and_a_column_without_figures_is_left_out(tmp_path, results):
