@@ -9,7 +9,7 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 from experiments.core.commands import find
-from experiments.core.recorded import RECORDED, show_recorded
+from experiments.core.recorded import recorded_names, show_recorded
 
 ROOT = Path(__file__).resolve().parent.parent
 BUILD = ROOT / "build"
@@ -76,8 +76,7 @@ def notebook_page(path: Path) -> str:
 def gallery(files: Files, config: Any) -> dict[str, str]:
     """The page of recorded results with their charts; each report becomes a file of the site."""
     known, page = find("experiments"), "# Gallery\n\nRecorded results, each with its charts and its whole report.\n"
-    for recorded in sorted((ROOT / RECORDED).glob("*.json")):
-        name = recorded.stem
+    for name in recorded_names():
         module = known[name].module
         show_recorded(name, module, BUILD / "recorded")
         source = ROOT / Path(*module.split(".")).with_suffix(".py")

@@ -22,6 +22,7 @@ from experiments.core.context import Context
 from experiments.core.look import PALETTE, SHARED
 from experiments.core.results import Cell, Picture, Results, Table, at_most, named_table
 from experiments.core.runner import Experiment
+from experiments.core.text import bounds
 from experiments.study import paper_numbers as paper
 
 
@@ -113,7 +114,7 @@ def _vtv_table(config: PaperAuditConfig) -> Table:
     ours, theirs = paper.VTV["Ours"][0][:5], paper.VTV["VTV-LLM-7B"][0][:5]
     for column, a, b in zip(paper.VTV_COLUMNS[:5], ours, theirs, strict=True):
         gain, half, p = paper_checks.gain_interval(a, b, config.vtv_items)
-        span = f"[{gain - half:.1f}, {gain + half:.1f}]"
+        span = bounds(gain - half, gain + half, ".1f")
         rows.append({"property": column, "Touch-R1": a, "VTV-LLM": b, "gain": gain, "95 %": span, "p": p})
     return named_table(
         f"Gains on VTV150K, {config.vtv_items} questions a property",

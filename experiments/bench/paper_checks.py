@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 from scipy import optimize, special
 
+from experiments.core.text import number
 from experiments.study import paper_numbers as paper
 from touchr1_jax.bench.statistics import wilson_interval
 
@@ -235,7 +236,7 @@ def _claims() -> Iterator[StatementCheck]:
     yield _check(
         "Gains on VTV150K are within one run's noise",
         f"VTV150K table, {paper.VTV_ITEMS} questions a property",
-        f"{min(gains):+.1f} to {max(gains):+.1f} points",
+        f"{number(min(gains), '+.1f')} to {number(max(gains), '+.1f')} points",
         f"95 % intervals of ± {min(halves):.0f} to {max(halves):.0f} points, p ≥ {min(p):.2f} (unpaired)",
         all(half > gain for gain, half in zip(gains, halves, strict=True)),
         "unsupported",
@@ -303,7 +304,8 @@ def confirmed() -> tuple[StatementCheck, ...]:
     for where, column, model, claimed in paper.GAINS:
         gain = cell(OURS, column) - cell(model, column)
         wrong = not abs(gain - claimed) < SHARE_ROUNDING
-        gains.append(_check(f"{column} over {model}", where, f"{claimed:+.1f}", f"{gain:+.1f} points", wrong))
+        shown, found = number(claimed, "+.1f"), f"{number(gain, '+.1f')} points"
+        gains.append(_check(f"{column} over {model}", where, shown, found, wrong))
     worst, ends = _worst_average(paper.VTV), ("OMAE", "CSC", "Avg")
     differ = any(
         tuple(cell(main, column) for column in ends) != paper.LADDER[name] for main, name in SAME_MODELS.items()

@@ -212,13 +212,13 @@ def task_table(counts: Mapping[str, int], scored: Mapping[str, Interval]) -> Tab
     width, deviation = f"± of {paper.VTV_ITEMS}", lambda p: math.sqrt(p * (1 - p) / paper.VTV_ITEMS)
     rows: list[dict[str, Cell]] = [
         {
-            "task": task,
+            "task": name,
             "asks for": MEANINGS[task],
             "questions": counts[task],
             "chance": CHANCE[task],
             width: 196 * deviation(scored[task].mean / 100),
         }
-        for task in VTV
+        for task, name in zip(VTV, paper.VTV_COLUMNS, strict=True)
     ]
     meaning = (
         "half the 95 % interval of the first row's share if it were measured on the benchmark's number of questions "

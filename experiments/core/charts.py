@@ -39,6 +39,10 @@ LONG_AXIS = 300.0
 ITERATIONS = 200
 """Of the placement of labels; a limit in seconds would make a picture depend on the machine."""
 
+STROKES, STROKE = ("|", "_", "x", "+"), 1.5  # markers without an area, width of their lines in points
+BEHIND = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}  # text, legible on lines that it crosses
+ROOM = 0.12  # for the figure at the end of the longest bar, over the length of the axis
+
 Values = Sequence[float] | np.ndarray  # numbers [N]
 
 Scale = Literal["linear", "log", "symlog"]
@@ -204,7 +208,7 @@ def bars(
         rows=list(values),
         x_label=label,
         x_scale="log" if logarithmic else "linear",
-        x_limits=(min(figures) / 2, 2 * max(figures)) if logarithmic else (0.0, 1.12 * max(figures)),
+        x_limits=(min(figures) / 2, 2 * max(figures)) if logarithmic else (0.0, None),
         rules=[Rule(x=bound) for bound in bounds],
         written=written,
     )
@@ -310,7 +314,8 @@ def _draw_bars(axes: Axes, panel: Panel) -> None:
             left = left + np.nan_to_num(series.x)
         if panel.written and (not panel.stacked or i == len(every) - 1):
             figures = [number(value, panel.written) for value in (left if panel.stacked else series.x)]
-            axes.bar_label(drawn, figures, padding=3, fontsize=8)
+            axes.bar_label(drawn, figures, padding=3, fontsize=8, bbox=BEHIND)
+            axes.margins(x=ROOM)
 
 
 def _draw_points(axes: Axes, panel: Panel, series: Series) -> None:
@@ -318,7 +323,7 @@ def _draw_points(axes: Axes, panel: Panel, series: Series) -> None:
     if series.line and not panel.rows:
         axes.plot(series.x, series.y, series.line, color=series.colour, lw=series.width, alpha=series.alpha)
     if series.marker:
-        look = {"color": series.colour, "linewidths": 1.5 if series.marker in "|_x+" else 0}  # strokes have no area
+        look = {"color": series.colour, "linewidths": STROKE if series.marker in STROKES else 0}
         if series.hollow:
             look = {"facecolors": "none", "edgecolors": series.colour}
         axes.scatter(series.x, series.y, series.size, marker=series.marker, alpha=series.alpha, zorder=3, **look)
@@ -370,7 +375,8 @@ def _entries(panels: Sequence[Panel]) -> dict[str, Line2D | Patch]:
             colour = series.colour if isinstance(series.colour, str) else SHARED
             line = "" if panel.rows and not len(series.low) else series.line
             face = "none" if series.hollow else colour
-            handle = Line2D([], [], color=colour, lw=series.width, ls=line, marker=series.marker, mfc=face, ms=5)
+            look = {"mfc": face, "ms": 5} | ({"ms": 8, "mew": STROKE} if series.marker in STROKES else {})
+            handle = Line2D([], [], color=colour, lw=series.width, ls=line, marker=series.marker, **look)
             entries.setdefault(series.name, Patch(color=colour, alpha=series.alpha) if series.bar else handle)
         for rule in panel.rules:
             entries.setdefault(rule.name, Line2D([], [], color=rule.colour, ls=rule.line, lw=rule.width))
@@ -381,7 +387,6 @@ def _entries(panels: Sequence[Panel]) -> dict[str, Line2D | Patch]:
 def _write_labels(axes: Axes, panel: Panel) -> None:
     texts, points = [], []
     line = {"arrowstyle": "-", "color": SHARED, "lw": 0.5}
-    behind = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}  # legible on lines that it crosses
     for series in panel.series:
         for i, (x, y) in enumerate(zip(series.x, series.y, strict=True)):
             if not np.isfinite((x, y)).all():
@@ -389,7 +394,7 @@ def _write_labels(axes: Axes, panel: Panel) -> None:
             points.append((x, y))
             if series.labels and series.labels[i]:
                 colour = series.colour if isinstance(series.colour, str) else SHARED
-                texts.append(axes.text(x, y, series.labels[i], fontsize=7.5, color=colour, bbox=behind))
+                texts.append(axes.text(x, y, series.labels[i], fontsize=7.5, color=colour, bbox=BEHIND))
     if texts:
         x, y = zip(*points, strict=True)
         adjust_text(texts, x, y, ax=axes, arrowprops=line, expand=(1.15, 1.5), iter_lim=ITERATIONS)

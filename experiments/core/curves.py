@@ -21,15 +21,18 @@ FEWEST_POINTS = 25
 
 WORDS = {
     "degenerate_share": "share of groups whose rewards are all equal",
+    "echo_share": "share of answers with one level in all slots",
     "entropy": "entropy (nat a token)",
     "grounding": "KL to the answers without a stream (nat)",
+    "held_out": "score on validation objects",
     "kl": "KL to the reference (nat a token)",
     "length": "length (tokens)",
     "loss": "loss (nat a token)",
     "middle_rate": "share of middle levels",
+    "mode_share": "share of the commonest level",
     "parse_rate": "share of readable answers",
 }
-"""Scalar → its name in a chart, where that of the log says too little."""
+"""Scalar → its name in a chart, where the words in that of the log say too little."""
 
 Curve = tuple[np.ndarray, np.ndarray]  # steps and values of one logged scalar of one stage
 
@@ -94,7 +97,7 @@ def training_curves(scalars: Mapping[str, Mapping[tuple[str, str], Curve]], colo
     panels = [
         Panel(
             _seeds_and_means(series, colour, most),
-            title=WORDS.get(name, name),
+            title=WORDS.get(name, name.replace("_", " ")),
             x_label="step" if i >= len(scalars) - columns else "",
         )
         for i, (name, series) in enumerate(scalars.items())

@@ -20,11 +20,14 @@ from typing import Any
 from experiments.core.artifacts import read_json, write_json, write_text
 from experiments.core.report import write_report
 from experiments.core.results import from_json
-from experiments.core.runs import ROOT
+from experiments.core.runs import ROOT, PastRun
 from experiments.core.text import number
 
 RECORDED = Path("experiments/recorded")
 """Folder of the checkout with the run of each experiment that the README shows."""
+
+RECORDED_RUN = "recorded"
+"""Name of a recorded run in place of a stamp, and so of the folder that `show` writes."""
 
 BEGIN, END = "<!-- results: `python -m experiments.core.recorded fill` writes this table -->", "<!-- /results -->"
 
@@ -60,20 +63,36 @@ def _placeless(value: Any) -> Any:
 
 def show_recorded(name: str, module: str, runs_dir: Path) -> tuple[str, ...]:
     """Write the recorded results of an experiment as its report; the lines to print, `FigureError` without any."""
-    found, folder = _read(name, ROOT), runs_dir / name / "recorded"
+    past = recorded_run(name, runs_dir)
     source = ROOT / Path(*module.split(".")).with_suffix(".py")
     about = ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))) or name
-    commit, _, dirty = found["git"].partition("-")
-    description = {"experiment": name, "scale": found["scale"], "git": {"commit": commit, "dirty": bool(dirty)}}
-    results = from_json(found)
-    report = write_report(folder, results, about=about, description=description | {"config": found["config"]})
+    results = from_json(past.results or {})
+    report = write_report(past.directory, results, about=about, description=past.description)
     return (f"report: {report}", *results.verdict)
+
+
+def recorded_names(root: Path = ROOT) -> list[str]:
+    """The experiments of which a checkout holds recorded results."""
+    return sorted(path.stem for path in (root / RECORDED).glob("*.json"))
+
+
+def recorded_run(name: str, runs_dir: Path, root: Path = ROOT) -> PastRun:
+    """The recorded results of an experiment as a run in RUNS/NAME/recorded, `FigureError` without any.
+
+    Only `show_recorded` makes that folder, with a page and the charts that the results hold.
+    """
+    found = _read(name, root)
+    commit, _, dirty = found["git"].partition("-")
+    git = {"commit": commit, "dirty": bool(dirty)}
+    description = {"experiment": name, "scale": found["scale"], "git": git, "config": found["config"]}
+    directory = runs_dir / name / RECORDED_RUN
+    return PastRun(directory=directory, description=description, seconds=None, results=found, in_use=False)
 
 
 def _read(name: str, root: Path) -> Mapping[str, Any]:
     file = root / RECORDED / f"{name}.json"
     if not file.exists():
-        known = ", ".join(sorted(path.stem for path in (root / RECORDED).glob("*.json")))
+        known = ", ".join(recorded_names(root))
         raise FigureError(
             f"name is {name!r}: no run of it is recorded in {RECORDED}; choose from {known}, or record one"
         )

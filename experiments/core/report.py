@@ -20,7 +20,7 @@ from experiments.core.results import Cell, Column, Comparison, Results, Slot, Ta
 from experiments.core.text import MEANINGLESS, SMOKE, bounds, number, plain
 from touchr1_jax.bench.scoring import REPORTED
 
-_FIGURES = re.compile(r"[-+−–\d\s.,:;%×()\[\]]*")
+_FIGURES = re.compile(r"[-+−–\d\s.,:;%×()\[\]]{0,40}")  # more of them take several lines, as words do
 
 
 def write_report(directory: Path, results: Results, *, about: str, description: Mapping[str, Any]) -> Path:

@@ -4,7 +4,8 @@
 
 Reads the newest finished run of every experiment that measures speed against error, compares each default with the
 other rows of its table, and shows the charts of these runs, with those of the experiments that measure where methods
-break.  It measures nothing itself: run those experiments first.
+break.  Where an experiment has not run here beyond `smoke`, its recorded result takes that place, without charts.
+`pareto` measures nothing itself: run the other experiments first.
 
 Cost: a second.
 
@@ -18,9 +19,11 @@ from typing import Any, Literal, NamedTuple
 
 from experiments.core.context import Context
 from experiments.core.errors import require
+from experiments.core.recorded import RECORDED_RUN, recorded_names, recorded_run
 from experiments.core.results import Picture, Results, Table, at_most, named_table
 from experiments.core.runner import Experiment
-from experiments.core.runs import PastRun, read_run, started
+from experiments.core.runs import ROOT, PastRun, read_run, started
+from experiments.core.text import SMOKE
 from experiments.encoder.variants import STUDIED
 from experiments.fields.tracking_accuracy import DENSE_DEFAULT, MARKER_DEFAULT
 from experiments.mechanics.tangential_methods import MAIN as FRICTION
@@ -61,6 +64,8 @@ CHARTS_ONLY = (
 )  # fmt: skip
 """Experiments whose charts are shown without a default to judge."""
 
+RUN_MEANING = {"run": f"when it began here; '{RECORDED_RUN}' where the repository's recorded result stands for it"}
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GatherConfig:
@@ -81,9 +86,10 @@ class ParetoPoint(NamedTuple):
 
 
 class DefaultJudgement(NamedTuple):
-    """A default on one table: all measured points, and those that dominate it (`None`: it was not measured)."""
+    """A default on one table of a run: all measured points, and those that dominate it (`None`: not measured)."""
 
     judged: JudgedDefault
+    run: str
     title: str
     points: tuple[ParetoPoint, ...]
     dominated_by: tuple[ParetoPoint, ...] | None
@@ -96,35 +102,46 @@ def run(config: GatherConfig, context: Context) -> Results:
     newest = {name: newest_run(home / name) for name in names}
     runs = {name: past for name, past in newest.items() if past is not None}
     missing = [name for name in names if name not in runs]
+    recorded = [name for name, past in runs.items() if past.directory.name == RECORDED_RUN]
     judgements = [j for judged in DEFAULTS if judged.experiment in runs for j in judge(judged, runs[judged.experiment])]
     dominated = at_most("defaults that are dominated", sum(bool(j.dominated_by) for j in judgements), 0)
     return Results(
-        verdict=verdict(judgements, missing),
+        verdict=verdict(judgements, recorded, missing),
         requirements=(dominated,) if judgements else (),
         tables=(
             default_table(judgements),
             choice_table(judgements),
-            named_table("Runs", [{"experiment": name, "run": past.summary} for name, past in runs.items()]),
+            named_table(
+                "Runs",
+                [{"experiment": name, "run": past.summary} for name, past in runs.items()],
+                meanings=RUN_MEANING,
+            ),
         ),
         pictures=tuple(picture for name, past in runs.items() for picture in charts(name, past)),
-        settings={"runs": str(home), "not run yet": ", ".join(missing) or "none"},
+        settings={
+            "runs": str(home),
+            "recorded": ", ".join(recorded) or "none",
+            "neither run nor recorded": ", ".join(missing) or "none",
+        },
     )
 
 
-def newest_run(home: Path) -> PastRun | None:
-    """The newest finished run of an experiment; any scale is preferred to `smoke`."""
-    finished = [past for past in map(read_run, started(home)) if past.results is not None]
-    return min(finished, key=lambda past: past.description["scale"] == "smoke", default=None)
+def newest_run(home: Path, root: Path = ROOT) -> PastRun | None:
+    """The newest finished run of an experiment, else what a checkout has recorded, else a `smoke` run."""
+    found = [past for past in map(read_run, started(home)) if past.results is not None]
+    found += [recorded_run(home.name, home.parent, root)] if home.name in recorded_names(root) else []
+    return min(found, key=lambda past: past.description["scale"] == SMOKE, default=None)
 
 
 def judge(judged: JudgedDefault, past: PastRun) -> list[DefaultJudgement]:
     """Compare a default with the other rows on every matching table of a run."""
     judgements = []
     for table in [] if past.results is None else past.results["tables"]:
-        default = next((str(row[0]) for row in table["rows"] if str(row[0]).startswith(judged.default)), None)
+        default = next((name for name in row_names(table) if name.startswith(judged.default)), None)
         if table["title"].startswith(judged.table) and default is not None:
             points = points_of(table, judged.axes)
-            judgements.append(DefaultJudgement(judged, table["title"], points, dominators(default, points)))
+            by = dominators(default, points)
+            judgements.append(DefaultJudgement(judged, past.directory.name, table["title"], points, by))
     return judgements
 
 
@@ -141,10 +158,16 @@ def points_of(table: Mapping[str, Any], axes: Axes) -> tuple[ParetoPoint, ...]:
         require(bool(found), f"axis of table {table['title']!r}", axis, f"must begin one of {names}", "rename it")
         signs[found[0]] = 1.0 if better == "lower" else -1.0
     return tuple(
-        ParetoPoint(str(row[0]), tuple(sign * float(row[i]) for i, sign in signs.items()))
-        for row in table["rows"]
+        ParetoPoint(name, tuple(sign * float(row[i]) for i, sign in signs.items()))
+        for name, row in zip(row_names(table), table["rows"], strict=True)
         if all(isinstance(row[i], int | float) and not isinstance(row[i], bool) for i in signs)
     )
+
+
+def row_names(table: Mapping[str, Any]) -> list[str]:
+    """The name of each row: its first cell, and the second where several rows begin alike."""
+    first = [row[0] for row in table["rows"]]
+    return [f"{row[0]} {row[1]}" if first.count(row[0]) > 1 else str(row[0]) for row in table["rows"]]
 
 
 def front(points: Sequence[ParetoPoint]) -> tuple[ParetoPoint, ...]:
@@ -167,20 +190,23 @@ def choice_table(judgements: Sequence[DefaultJudgement]) -> Table:
     for j in judgements:
         for point in j.points:
             by = dominators(point.name, j.points) or ()
-            rows.append({"choice": point.name, "measured in": j.title, "dominated by": by[0].name if by else "–"})
-    return named_table("Choices", rows, meanings={"dominated by": "no worse on any axis of that table, better on one"})
+            found = by[0].name if by else "–"
+            rows.append({"choice": point.name, "measured in": j.title, "dominated by": found, "run": j.run})
+    meanings = RUN_MEANING | {"dominated by": "no worse on any axis of that table, better on one"}
+    return named_table("Choices", rows, meanings=meanings)
 
 
-def verdict(judgements: Sequence[DefaultJudgement], missing: Sequence[str]) -> tuple[str, ...]:
-    """Name the dominated defaults, the methods that dominate them, and the experiments that have not run."""
+def verdict(judgements: Sequence[DefaultJudgement], recorded: Sequence[str], missing: Sequence[str]) -> tuple[str, ...]:
+    """Name the dominated defaults, the methods that dominate them, and the experiments that have not run here."""
     dominated = [
         f"The default of {j.judged.what}, {j.judged.default}, is dominated in '{j.title}' by {_names(j.dominated_by)}."
         for j in judgements
         if j.dominated_by
     ]
     none = [f"None of {len(judgements)} judgements finds a default dominated."] if judgements else []
-    unmeasured = [f"Not run yet, so not judged: {', '.join(missing)}."] if missing else []
-    return (*(dominated or none), *unmeasured)
+    elsewhere = [f"Not run here, so by the recorded result: {', '.join(recorded)}."] if recorded else []
+    unmeasured = [f"Neither run here nor recorded, so left out: {', '.join(missing)}."] if missing else []
+    return (*(dominated or none), *elsewhere, *unmeasured)
 
 
 def _names(points: Sequence[ParetoPoint]) -> str:
@@ -200,10 +226,11 @@ def default_table(judgements: Sequence[DefaultJudgement]) -> Table:
                 "measured": len(j.points),
                 "on the front": len(front(j.points)),
                 "dominated by": "not measured" if j.dominated_by is None else _names(j.dominated_by) or "nothing",
+                "run": j.run,
             }
             for j in judgements
         ],
-        meanings={"measured": "rows that have a number on every axis"},
+        meanings=RUN_MEANING | {"measured": "rows that have a number on every axis"},
     )
 
 

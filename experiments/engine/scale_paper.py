@@ -189,7 +189,7 @@ def memory_table(config: ScaleConfig, lines: Lines, reserved: Reserved) -> Table
             for setup, c in reserved.items()
         ],
         formats=dict.fromkeys(("arguments", "temporary", "peak", "counted"), ".2f"),
-        note="On `cpu` the compiler multiplies bfloat16 as float32, layer by layer: an upper bound.",
+        note="On a CPU the compiler multiplies bfloat16 as float32, layer by layer: an upper bound.",
     )
 
 

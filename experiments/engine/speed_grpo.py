@@ -128,7 +128,7 @@ def run(config: SpeedConfig, context: Context) -> Results:
             report.memory_table(f"Compiling at prefix {lean_at}", compiled),
             *((report.memory_table(f"A vocabulary of {config.words:,} words", worded),) if worded else ()),
         ),
-        settings={"beta": BETA, "micro_prompts": 1, "devices": str(jax.devices())},
+        settings={"beta": BETA, "micro_prompts": 1, "devices": [device.device_kind for device in jax.devices()]},
     )
 
 

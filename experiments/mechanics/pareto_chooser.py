@@ -28,6 +28,7 @@ from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context
 from experiments.core.results import Cell, Picture, Requirement, Results, Table, at_least, at_most, named_table
 from experiments.core.runner import Experiment
+from experiments.core.text import number
 from experiments.mechanics import chooser_measure as measured
 from experiments.mechanics import chooser_trial as trial
 from experiments.mechanics.chooser_measure import FAMILIES, MenuMeasurements, SceneBatch
@@ -275,7 +276,7 @@ def _cost_table(menu: Sequence[Setting], cost: np.ndarray) -> Table:
 
 def _law_table(refitted: Law) -> Table:
     laws = {"": chooser_law.LAW, ", refitted": refitted}
-    shown = lambda law, name: ", ".join(f"{c:.3f}" for c in np.atleast_1d(getattr(law, name)))
+    shown = lambda law, name: ", ".join(number(c, ".3f") for c in np.atleast_1d(getattr(law, name)))
     return named_table(
         "The law",
         [

@@ -100,7 +100,7 @@ def diagnose(
     if {"csc_slot", "csc"} <= both:
         slots, right = (after[m] - before[m] for m in ("csc_slot", "csc"))
         if slots > POINTS and right < slots - POINTS:
-            yield f"F2: CSC-slot {slots:+.0f} points, CSC {right:+.0f}"
+            yield f"F2: CSC-slot {number(slots, '+.0f')} points, CSC {number(right, '+.0f')}"
     if (degenerate := history.end.get("drawn_degenerate_share", history.end.get("degenerate_share", 0.0))) > MOST:
         yield f"F7: in {100 * degenerate:.0f} % of the groups all rewards are equal, which gives no gradient"
     first, last = (steps.get("entropy", 0.0) for steps in (history.start, history.end))

@@ -28,7 +28,7 @@ from experiments.core.charts import Panel, Rule, Series, draw, estimates
 from experiments.core.context import Context
 from experiments.core.look import PALETTE, SHARED
 from experiments.core.results import Picture, Requirement, Results, Table, at_least, named_table
-from experiments.core.text import bounds, interval
+from experiments.core.text import bounds, interval, number
 from experiments.paper import presets
 from experiments.paper.components import FULL, run_full_model
 from experiments.paper.touch_gain import (
@@ -223,7 +223,7 @@ def verdict(contrasts: Contrasts, revised: Mapping[str, float], gain: TouchGain 
         )
     if DISGUISED in contrasts:
         lead = contrasts[DISGUISED]
-        sentences.append(f"On all questions about {DISGUISED} it leads by {lead.seeds.mean:+.1f} points.")
+        sentences.append(f"On all questions about {DISGUISED} it leads by {number(lead.seeds.mean, '+.1f')} points.")
     if gain is not None:
         sentences.append(
             f"Accuracy gains at least {interval(gain.least.gain, '.1f')} points from touch (least over the controls: "

@@ -29,7 +29,7 @@ from experiments.core.charts import Panel, draw, estimates
 from experiments.core.context import Context
 from experiments.core.results import Cell, Comparison, Estimate, Picture, Results, Table, named_table
 from experiments.core.runner import Experiment
-from experiments.core.text import bounds, interval
+from experiments.core.text import bounds, interval, number
 from experiments.encoder.pretrain import pretrain
 from experiments.paper.label_free import agreed_levels, measured_levels
 from experiments.study.answers import answers_path, load_answers, save_answers
@@ -320,9 +320,9 @@ def verdict(comparisons: Sequence[Comparison], counts: Sequence[int]) -> tuple[s
                 found = [c for c in comparisons if (c.arm, c.against) == of and c.metric == "acc"]
                 label = f"{count} labels" + (f" ({start} encoder)" if encoder is None else "")
                 if found and all(c.low > 0 for c in found):
-                    pays.append(f"{label} {found[0].difference:+.1f}")
+                    pays.append(f"{label} {number(found[0].difference, '+.1f')}")
                 if found and all(c.high < 0 for c in found):
-                    costs.append(f"{label} {found[0].difference:+.1f}")
+                    costs.append(f"{label} {number(found[0].difference, '+.1f')}")
         sentences.append(
             f"{title[0].upper()}{title[1:]} raises accuracy significantly at {', '.join(pays) or 'no number of labels'}"
             f" and lowers it at {', '.join(costs) or 'none'}."
@@ -345,7 +345,7 @@ def curve_table(
                 for c in comparisons:
                     same = c.arm == name and c.metric == "acc" and c.against.endswith(f"-{encoder}")
                     if same and c.over == "objects":
-                        line["gain"] = f"{c.difference:+.1f} {bounds(c.low, c.high, '.1f')}"
+                        line["gain"] = f"{number(c.difference, '+.1f')} {bounds(c.low, c.high, '.1f')}"
                 lines.append(line)
     return named_table(
         "Policies by method, labelled contacts and encoder",

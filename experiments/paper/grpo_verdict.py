@@ -26,7 +26,7 @@ from experiments.core.context import Context
 from experiments.core.loops import STEPPING
 from experiments.core.results import Cell, Comparison, Estimate, Results, Table, named_table
 from experiments.core.runner import Experiment
-from experiments.core.text import bounds, interval
+from experiments.core.text import bounds, interval, number
 from experiments.study.answers import answers_path, load_answers, save_answers, share_right
 from experiments.study.dataset import Dataset
 from experiments.study.estimates import SeedScores, compare_rows, estimate_rows
@@ -244,7 +244,8 @@ def verdict(comparisons: Sequence[Comparison], arms: Sequence[str]) -> tuple[str
         f"The claim that reinforcement improves a tactile policy {claim}: of {len(arms)} arms {len(better)} have a "
         f"higher accuracy or a lower error than SFT continued for the same time (95 % intervals over objects and over "
         f"seeds exclude 0), and {len(worse)} are worse in accuracy, error, material or agreement of single sensors.",
-        f"The differences in accuracy lie between {min(differences):+.1f} and {max(differences):+.1f} points.",
+        f"The differences in accuracy lie between {number(min(differences), '+.1f')} and "
+        f"{number(max(differences), '+.1f')} points.",
     )
 
 
@@ -265,7 +266,8 @@ def verdict_table(
         for over in ("objects", "seeds"):
             found = by.get((name, "acc", over))
             if found is not None:
-                line[f"accuracy over {over}"] = f"{found.difference:+.1f} {bounds(found.low, found.high, '.1f')}"
+                mean = number(found.difference, "+.1f")
+                line[f"accuracy over {over}"] = f"{mean} {bounds(found.low, found.high, '.1f')}"
         stage = f"decoder/{name}" if name in (SFT, CONTINUED) else f"grpo/{name}-{rates[name]:g}"
         seconds = [timing[key] for seed in range(config.seeds) if (key := f"{STEPPING}/{stage}/{seed}") in timing]
         line["rate"] = rates.get(name)

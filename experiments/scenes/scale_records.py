@@ -19,7 +19,7 @@ import dataclasses
 import functools
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,14 @@ MOST_OPEN_S, MOST_MB, MOST_FIND_MS, MOST_GROWTH = 3.0, 500.0, 1.0, 1.5
 Units = Mapping[str, float]
 """Measured figures by name: those of `measure_units`, or of `index_cost`."""
 
+TITLES = {
+    "cpu_ms": "one core, ms", "bytes": "size, bytes", "sent": "requests to send", "read": "requests to read",
+    "clip_ms": "a clip, ms", "open_s": "opening, s", "open_cpu_s": "opening, s of a core", "peak_mb": "memory, MB",
+    "find_ms": "a contact by key, ms", "sort_s": "first search, s", "publish_ms": "one more shard, ms of a core",
+    "published_ms": "one more shard, ms",
+}  # fmt: skip
+"""Headings of measured figures."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class AssumedMachine:
@@ -58,6 +66,14 @@ class AssumedMachine:
     """Of a request."""
     requests_per_s: float = 3500.0
     """Uploads that the store takes under one prefix, from all machines."""
+
+    @property
+    def described(self) -> str:
+        """The machine in words."""
+        return (
+            f"{self.cores} cores at {self.hourly_price:g} an hour, {self.bandwidth_gb_s:g} GB/s and "
+            f"{self.latency_ms:g} ms a request to a store that takes {self.requests_per_s:,.0f} requests a second"
+        )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -96,13 +112,20 @@ def run(config: BillionConfig, context: Context) -> Results:
             at_most("one more shard, late over early", growth, MOST_GROWTH, note="time of a core"),
         ),
         tables=(
-            named_table("Measured: a record", [{"unit": "here", **units}], note="Requests a shard."),
-            named_table("Measured: the index", [few, many]),
+            measured_table("Measured: a record", [{"unit": "here", **units}], note="Requests are those of a shard."),
+            measured_table("Measured: the index", [few, many]),
             cost_table(config, units, many),
             named_table(f"Simulated: {config.records:,} records", rows, note="The slowest of the four limits."),
         ),
-        settings={"assumed machine": str(config.machine)},
+        settings={"assumed machine": config.machine.described},
     )
+
+
+def measured_table(title: str, rows: Sequence[Mapping[str, Any]], note: str = "") -> Table:
+    """Measured figures under headings in words."""
+    titled = [{TITLES.get(name, name): value for name, value in row.items()} for row in rows]
+    size = TITLES["bytes"]
+    return named_table(title, titled, formats={size: ",.0f"} if size in titled[0] else {}, note=note)
 
 
 def _index(contacts: int, publications: int) -> Units:
@@ -196,7 +219,7 @@ def cost_table(config: BillionConfig, units: Units, index: Units) -> Table:
         "s to open the index": index["open_s"] * contacts / index["contacts"],
         "MB of memory of a reader": index["peak_mb"] * contacts / index["contacts"],
     }
-    rows = [{"figure": name, "simulated": value} for name, value in figures.items()]
+    rows = [{"figure": name, "simulated": round(value) if value >= 1000 else value} for name, value in figures.items()]
     return named_table(f"Simulated: all of {config.records:,} records", rows, formats={"simulated": ",.4g"})
 
 

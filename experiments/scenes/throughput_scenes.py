@@ -23,7 +23,6 @@ import numpy as np
 
 from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context
-from experiments.core.look import SHARED
 from experiments.core.results import Cell, Picture, Requirement, Results, Table, at_least, at_most, named_table
 from experiments.core.runner import Experiment
 from experiments.scenes import throughput_rates
@@ -144,7 +143,7 @@ def run(config: ThroughputConfig, context: Context) -> Results:
         pictures=(_picture(config, rates, parts),),
         settings={"threads": config.threads, "frames": config.frames, "contact_grid": config.contact_grid},
         data={"feed_records": feed.records, "large_records": large.records, "written_records": written.rate.records},
-        timing={"feed_s": feed.seconds, "large_s": large.seconds, "written_s": written.rate.seconds},
+        timing={"feeding": feed.seconds, "feeding large": large.seconds, "writing": written.rate.seconds},
     )
 
 
@@ -317,7 +316,7 @@ def _leak_table(leaks: list[dict[str, Any]]) -> Table:
 
 def _picture(config: ThroughputConfig, rates: Sequence[NamedRate], parts: Parts) -> Picture:
     measured = Series(x=[r.rate.per_second for r in rates], bar=True)
-    marks = Series("required", x=[r.required for r in rates], line="", marker="|", size=300, colour=SHARED)
+    marks = Series("required", x=[r.required for r in rates], line="", marker="|", size=300, colour="black")
     names = list(next(iter(parts.values())))
     stacked = [Series(part, x=[max(costs[part], 0.0) for costs in parts.values()], bar=True) for part in names]
     panels = [
@@ -335,7 +334,7 @@ def _picture(config: ThroughputConfig, rates: Sequence[NamedRate], parts: Parts)
 
 SMOKE = ThroughputConfig(
     image_px=32,
-    large_px=32,
+    large_px=48,
     frames=20,
     contact_grid=24,
     feed_contacts=4,

@@ -52,7 +52,8 @@ def level_report(study: Study) -> tuple[tuple[Picture, ...], tuple[Table, ...]]:
     )
     pictures, tables = sampled_report(study)
     tables = (reliability_table({name: rows[name] for name in study.policies}, words), *tables)
-    with_agreement = {name: answers for name, answers in rows.items() if answers.agree is not None}
+    read = lambda of: of.agree is not None and np.any(of.answer != BOTTOM)
+    with_agreement = {name: answers for name, answers in rows.items() if read(answers)}
     if not with_agreement:
         return (confusions, *pictures), tables
     if len(with_agreement) > len(PALETTE):  # more lines than colours: keep where training begins and where it ends

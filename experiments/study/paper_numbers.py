@@ -165,4 +165,6 @@ AUDITED, AUDIT_PASSED = 2_000, 91.6
 
 def differences_table(rows: Sequence[tuple[str, str, str]]) -> Table:
     """Differences between the paper's experiment and this one: topic, in the paper, here."""
-    return named_table("What differs from the paper", [{"": topic, "paper": a, "here": b} for topic, a, b in rows])
+    return named_table(
+        "What differs from the paper", [{"subject": topic, "paper": a, "here": b} for topic, a, b in rows]
+    )

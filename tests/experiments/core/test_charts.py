@@ -47,6 +47,8 @@ def test_stacked_bars_lie_end_to_end_and_grouped_ones_begin_together():
     stacked = draw([Panel(of, rows=["one", "two"], stacked=True, written=".0f")], legend=False)
     assert ends(stacked, PALETTE[1])[0][0] == pytest.approx(ends(stacked)[0][1], abs=0.01)
     assert {"4", "3"} <= texts(stacked)
+    bare = draw([Panel(of, rows=["one", "two"], stacked=True)], legend=False)
+    assert ends(stacked, PALETTE[1])[0][1] < 0.95 * ends(bare, PALETTE[1])[0][1]  # leaves room for its figure
     grouped = draw([Panel(of, rows=["one", "two"])], legend=False)
     assert ends(grouped)[0][0] == pytest.approx(ends(grouped, PALETTE[1])[0][0], abs=0.01)
 

@@ -108,7 +108,7 @@ def test_the_page_is_well_formed_whole_and_loads_nothing(tmp_path, results):
     assert not re.search(r"https?://|@import|url\(", page)
     assert not {"script", "link", "iframe"} & reader.seen
     for text in (
-        "Does it?", "Being paid helps.", "paid", "unpaid", "blind", "preset paper", "lr_scale 100", "loss",
+        "Does it?", "Being paid helps.", "paid", "unpaid", "blind", "preset paper", "lr scale 100", "loss",
         "<th>sft</th><td>2</td><td>2.0</td><td>4.0</td>",
         "NOT MET", "≥ 400 records/s", "−2.00", "winkler", "–", "left is faster", "Fields of xense",
     ):  # fmt: skip
@@ -186,6 +186,7 @@ def test_a_run_without_curves_rollouts_or_middle_rate_has_no_such_sections(tmp_p
 def test_figures_with_intervals_are_figures_and_a_missing_one_is_no_word():
     rows = [{"arm": "a", "gain": "+1.0 [−0.2, 2.1]", "p": 0.1, "why": None}, {"arm": "b", "gain": "–", "why": "noise"}]
     assert word_columns(named_table("", rows)) == [True, False, False, True]
+    assert word_columns(named_table("", [{"law": "fitted", "of": "0.1, " * 9}])) == [True, True]  # long
 
 
 def test_pairs_of_a_metric_are_together_and_a_column_without_figures_is_left_out(tmp_path, results):

@@ -4,6 +4,7 @@ import pytest
 
 from experiments.core.artifacts import read_json, write_json, write_text
 from experiments.core.errors import ResultsError
+from experiments.core.recorded import RECORDED, recorded_names
 from experiments.engine import pareto
 from experiments.engine.pareto import (
     DEFAULTS,
@@ -40,6 +41,8 @@ def test_points_are_rows_with_a_number_on_every_axis():
     points = points_of(TABLE, {"time": "lower", "slope": "higher"})
     assert points[0] == ParetoPoint("Winkler", (0.1, -0.5))
     assert [p.name for p in points] == ["Winkler", "nested 1e-3", "plain"]
+    again = TABLE | {"rows": [["DAPO", 4, 0.5], ["DAPO", 8, 0.4], ["RLOO", 4, 0.3]]}
+    assert [p.name for p in points_of(again, {"slope": "higher"})] == ["DAPO 4", "DAPO 8", "RLOO"]
     with pytest.raises(ResultsError, match="'speed'"):
         points_of(TABLE, {"speed": "lower"})
 
@@ -62,22 +65,38 @@ def test_the_page_names_dominated_defaults_and_shows_the_charts(tmp_path):
     finished(tmp_path, "20260101-000000", TABLE["rows"])
     directory = run_shrunk(pareto, GatherConfig(others=tmp_path), tmp_path / "first")
     results = read_json(directory / "results.json")
-    defaults, choices, runs = results["tables"]
-    assert {row[0]: row[2] for row in choices["rows"]} == {"Winkler": "–", "nested 1e-3": "–", "plain": "nested 1e-3"}
-    assert [row[4:] for row in defaults["rows"]] == [[3, 2, "nothing"]]
-    assert [row[0] for row in runs["rows"]] == ["pareto_contact"]
-    assert results["requirements"][0]["measured"] == 0
-    assert "pareto_storage" in results["settings"]["not run yet"]
+    defaults, choices, _ = results["tables"]
+    of_run = [row for row in choices["rows"] if row[-1] == "20260101-000000"]
+    assert {row[0]: row[2] for row in of_run} == {"Winkler": "–", "nested 1e-3": "–", "plain": "nested 1e-3"}
+    assert defaults["rows"][0][4:] == [3, 2, "nothing", "20260101-000000"]
+    assert "pareto_storage" in results["settings"]["neither run nor recorded"]
     assert (directory / "plots" / "pareto_contact-pareto_contact.svg").exists()
     finished(tmp_path, "20260102-000000", [*TABLE["rows"], ["new", 1.0, 0.01]])
     results = read_json(run_shrunk(pareto, GatherConfig(others=tmp_path), tmp_path / "second") / "results.json")
-    assert results["tables"][0]["rows"][0][-1] == "new"
+    assert results["tables"][0]["rows"][0][6:] == ["new", "20260102-000000"]
     assert not results["requirements"][0]["met"]
 
 
-def test_a_full_run_is_preferred_to_a_newer_smoke_run(tmp_path):
-    assert newest_run(tmp_path / "pareto_contact") is None
+def test_recorded_results_stand_for_what_did_not_run_here(tmp_path):
+    results = read_json(run_shrunk(pareto, GatherConfig(others=tmp_path / "none"), tmp_path) / "results.json")
+    defaults, choices, runs = results["tables"]
+    kept = [row[0] for row in runs["rows"]]
+    assert kept
+    assert set(kept) <= set(recorded_names())
+    assert all(row[1].startswith("recorded  default, code ") for row in runs["rows"])
+    assert {row[-1] for row in (*choices["rows"], *defaults["rows"])} == {"recorded"}
+    assert results["settings"]["recorded"] == ", ".join(kept)
+    assert f"Not run here, so by the recorded result: {', '.join(kept)}." in results["verdict"]
+
+
+def test_a_full_run_is_preferred_to_the_recorded_one_and_that_to_a_newer_smoke_run(tmp_path):
+    home, root = tmp_path / "pareto_contact", tmp_path / "checkout"
+    assert newest_run(home, root) is None
+    finished(tmp_path, "20260103-000000", TABLE["rows"], scale="smoke")
+    assert newest_run(home, root).directory.name == "20260103-000000"
+    results = {"git": "b" * 40, "scale": "default", "config": {}, "tables": [{**TABLE, "rows": []}]}
+    write_json(root / RECORDED / "pareto_contact.json", results)
+    assert newest_run(home, root).summary == "recorded  default, code bbbbbbb: finished"
     finished(tmp_path, "20260101-000000", TABLE["rows"])
-    finished(tmp_path, "20260102-000000", TABLE["rows"], scale="smoke")
-    assert newest_run(tmp_path / "pareto_contact").directory.name == "20260101-000000"
-    assert judge(DEFAULTS[1], newest_run(tmp_path / "pareto_contact")) == []
+    assert newest_run(home, root).directory.name == "20260101-000000"
+    assert judge(DEFAULTS[1], newest_run(home, root)) == []

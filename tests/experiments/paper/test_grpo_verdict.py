@@ -54,7 +54,7 @@ def test_the_verdict_of_few_labels_names_where_a_step_pays_and_where_it_costs():
     costs = difference(-4, -2, "objects", arm="two_phases-30-pretrained", against="two_phases-30-random")
     sentences = curves_verdict([pays, costs], [10, 30])
     assert any("GRPO" in s and "10 labels (random encoder) +3.0" in s for s in sentences)
-    assert any(s.startswith("Stage 1") and "lowers it at 30 labels -3.0" in s for s in sentences)
+    assert any(s.startswith("Stage 1") and "lowers it at 30 labels −3.0" in s for s in sentences)
 
 
 def result(seconds: float, accuracy: float) -> PhaseResult:
