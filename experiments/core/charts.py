@@ -375,8 +375,8 @@ def _entries(panels: Sequence[Panel]) -> dict[str, Line2D | Patch]:
             colour = series.colour if isinstance(series.colour, str) else SHARED
             line = "" if panel.rows and not len(series.low) else series.line
             face = "none" if series.hollow else colour
-            look = {"mfc": face, "ms": 5} | ({"ms": 8, "mew": STROKE} if series.marker in STROKES else {})
-            handle = Line2D([], [], color=colour, lw=series.width, ls=line, marker=series.marker, **look)
+            stroke: dict[str, Any] = {"ms": 8, "mew": STROKE} if series.marker in STROKES else {"ms": 5}
+            handle = Line2D([], [], color=colour, lw=series.width, ls=line, marker=series.marker, mfc=face, **stroke)
             entries.setdefault(series.name, Patch(color=colour, alpha=series.alpha) if series.bar else handle)
         for rule in panel.rules:
             entries.setdefault(rule.name, Line2D([], [], color=rule.colour, ls=rule.line, lw=rule.width))
