@@ -9,7 +9,8 @@ lists the alarms of exploring policies (A1 to A5) that fired during training.
 
 Cost: five minutes of CPU time a seed, and the contacts, thirteen minutes once (`smoke` one minute).
 
-Expected: four of five questions in at least eight of ten seeds, and no alarm.
+Expected: four of five questions in at least eight of ten seeds.  In half of the seeds A4 fires early, until the policy
+tells the questions apart.
 """
 
 import dataclasses

@@ -151,7 +151,7 @@ def _rope(text: _Fields, head_dim: int, interleaved: bool) -> tuple[float, tuple
         raise ValueError(f"{rope.prefix}mrope_section is {list(sections)}: must be three, for time, row and column")
     if 2 * sum(sections) != head_dim or min(sections) < 0:
         raise ValueError(
-            f"{rope.prefix}mrope_section is {list(sections)}: must sum to half of head_dim, {head_dim / 2:g}; correct "
+            f"{rope.prefix}mrope_section is {list(sections)}: twice their sum must be head_dim, {head_dim}; correct "
             "config.json"
         )
     return theta, sections

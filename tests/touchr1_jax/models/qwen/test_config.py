@@ -202,7 +202,8 @@ def test_released_qwen3_config_is_read():
             "must be 'qwen2_5_vl' or 'qwen3_vl'; mixtures of experts are not computed",
         ),
         ("text_config", {"attention_bias": True}, "text_config.attention_bias is True: must be False"),
-        ("text_config", {"head_dim": 96}, r"mrope_section is \[24, 20, 20\]: must sum to half of head_dim, 48"),
+        ("text_config", {"head_dim": 10**400}, r"twice their sum must be head_dim, 10000"),
+        ("text_config", {"head_dim": 96}, r"mrope_section is \[24, 20, 20\]: twice their sum must be head_dim, 96"),
         ("text_config", {"head_dim": None}, "text_config.head_dim is None: must be a whole number above 0"),
         (
             "text_config",
