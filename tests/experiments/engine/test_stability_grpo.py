@@ -108,6 +108,7 @@ OUTCOME = ScenarioOutcome(
 )
 
 
+@pytest.mark.long
 def test_failures_and_alarms_are_counted():
     """Of 8 failed runs 6 raised the alarm, of 52 others 1; `stable` failed once of 20 where the other variant does."""
     assert summary_table([OUTCOME]).rows[0][2:] == (2.0, 3.0, 3.0, 1, 20, 0.75, pytest.approx(1 / 52))

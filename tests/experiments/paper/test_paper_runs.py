@@ -76,6 +76,7 @@ def test_results_hold_every_arm_and_baseline(results, directory):
     assert (directory / "plots" / "calibration.svg").exists()
 
 
+@pytest.mark.long
 def test_every_policy_of_every_seed_is_saved_and_found(directory, home):
     saved = {str(path.relative_to(directory / "policies")) for path in (directory / "policies").glob("*/*")}
     assert saved == {f"{name}/{seed}" for name in ARMS for seed in (0, 1)}
@@ -83,6 +84,7 @@ def test_every_policy_of_every_seed_is_saved_and_found(directory, home):
     assert found.saved.notes["name"] == "ablation_ordinal, ordinal, seed 1"
 
 
+@pytest.mark.long
 def test_comparisons_pair_arms_by_seed_and_baselines_by_object(results):
     both, pairs = results["arms"] | results["baselines"], {over: set() for over in ("seeds", "objects")}
     for c in results["comparisons"]:
@@ -98,6 +100,7 @@ def test_comparisons_pair_arms_by_seed_and_baselines_by_object(results):
     assert [(c["arm"], c["against"]) for c in own] == [(arm, "sft") for arm in TRAINED]
 
 
+@pytest.mark.long
 def test_results_tell_data_and_the_time_of_every_stage(results, directory):
     assert results["data"]["source"] == "generated"
     assert results["data"]["test_objects"] == 5

@@ -74,6 +74,7 @@ def test_answers_follow_the_evidence(trained):
     assert (choose(found) == videos.label).mean() > 0.6
 
 
+@pytest.mark.long
 def test_a_policy_read_back_answers_the_same(trained, tmp_path):
     videos, learned = trained
     save(tmp_path / "policy.npz", learned)

@@ -53,6 +53,7 @@ def test_evidence_of_recorded_touch_is_a_distribution_and_of_the_rest_nothing(da
         assert (evidence[:, 2, a, :levels] == 0).all()  # one object cannot be held out
 
 
+@pytest.mark.long
 def test_an_attribute_that_nobody_annotated_has_no_evidence(data, probed, context):
     label = np.where(np.arange(4) == 0, -1, data.label)
     evidence = gather_evidence(dataclasses.replace(data, label=label), probed, PROBE, context)

@@ -47,6 +47,7 @@ def test_generation_resumes_anywhere_with_the_same_values(some: list[list[Sequen
         _assert_same(whole[index], some[index // 2])
 
 
+@pytest.mark.long
 def test_generation_ends_and_refuses_a_start_outside() -> None:
     assert len(list(contacts(SMALL, start=SMALL.contact_count - 2))) == 2
     assert list(contacts(SMALL, start=SMALL.contact_count)) == []

@@ -73,6 +73,7 @@ def test_touch_is_read(step):
     assert train(step, batch_of(pattern, pattern), 250).mean() >= 0.99
 
 
+@pytest.mark.long
 def test_touch_problem_cannot_be_solved_blind(step):
     """The control: the same pattern in all prompts leaves only guessing."""
     pattern = np.arange(P) % 2

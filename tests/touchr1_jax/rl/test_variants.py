@@ -152,6 +152,7 @@ def test_buckets_must_ascend_below_the_length():
         of(Paper(), buckets=(6, 3))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "algorithm",
     [

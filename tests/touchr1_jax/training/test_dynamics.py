@@ -118,6 +118,7 @@ def test_the_target_gets_no_gradient_unless_it_leaks(state, batch, graded):
     assert gap(own, leaking) < 1e-5
 
 
+@pytest.mark.long
 def test_what_is_missing_has_no_influence(state, batch, graded):
     """Pixels of padding, and of a stream that is absent."""
     mask = np.ones((P, S, T), bool)

@@ -126,6 +126,7 @@ def test_a_blind_policy_is_packed_too(params, batch):
     assert_same(gradient(None, blind=True)(params, rows), gradient(None, blind=True)(params, unfelt))
 
 
+@pytest.mark.long
 def test_answers_of_which_a_part_counts_teach_that_part(params, batch):
     """Nothing of one example, the first tokens of another, not the third of a third, which later ones see."""
     counted = batch.token_mask.copy()

@@ -238,6 +238,7 @@ def test_what_passes_is_tried_again(training, stand_in, tmp_path, fault, changes
     assert [path for path, _ in stand_in.requests].count(COMPLETE) == 2 * P + 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("faults", "message"),
     [
