@@ -234,7 +234,7 @@ def build_active_policy(
       actions: the words of each (`Environment.actions`).
       decoder: sizes; the vocabulary comes from the language.
       attributes: those that are asked for; each needs a question in `QUESTIONS_OF_TOUCH`.
-      repeats: whether a trajectory may contain an action twice; leave it out where a second one returns the same.
+      repeats: whether a trajectory may contain an action twice; `False` suits actions that return the same again.
 
     Raises:
       ValueError: an attribute without a question, or as `compile_turns`.
