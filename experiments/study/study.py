@@ -70,6 +70,7 @@ class StudyConfig(TrainingConfig):
 
 
 SMOKE = StudyConfig(
+    model=dataclasses.replace(MODEL, decoder=dataclasses.replace(MODEL.decoder, num_layers=1)),  # most of it compiles
     seeds=2,
     scenes=SceneConfig(objects=60, sites=1),
     encoders=EncoderTrainingConfig(steps=12, batch_size=8),
