@@ -17,8 +17,8 @@ look-ahead, a policy whose observations are hidden while it chooses, every touch
 Sensors and motions also drop out of objects at random, unknown to plans and policies: a contact without them takes its
 time and returns nothing.
 
-Cost: 24 to 28 minutes on two cores, six to eight of them for the contacts, which are made once (`smoke` one minute and
-a half).
+Cost: 24 to 28 minutes on two cores, six to eight of them for the contacts, which are made once (`smoke` two
+minutes).
 
 Expected: one touch chosen by reward is seven points better than the best touch for all questions and as good as the
 best touch for each question, also where choices drop out.  A second touch adds little except where the first one
