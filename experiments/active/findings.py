@@ -210,15 +210,16 @@ def plan_table(
         one = estimates[name]
         mean = lambda field, name=name: float(np.mean([getattr(f[name], field).mean() for f in seeds if name in f]))
         by = np.mean([f[name].right.mean(0) for f in seeds if name in f], 0)
+        mixed = EQUAL in name  # of plans with fewer and more contacts: only answers and time are known
         rows.append(
             {
-                "plan": name,
+                "plan": name.removesuffix(f"_{MISSING}"),
                 "right": one[METRIC].mean,
                 "from": one[METRIC].low,
                 "to": one[METRIC].high,
-                "contacts": mean("contacts"),
+                "contacts": None if mixed else mean("contacts"),
                 "seconds": mean("seconds"),
-                "past the limit": mean("harm"),
+                "past the limit": None if mixed else mean("harm"),
             }
             | {p: 100 * float(x) for p, x in zip(PROPERTIES, by, strict=True)}
         )

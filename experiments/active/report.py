@@ -177,7 +177,13 @@ def seconds_picture(points: Mapping[str, Sequence[tuple[float, Interval]]]) -> P
         )
         for name, row in points.items()
     ]
-    panel = Panel(series, x_label="seconds of touch a question", y_label="right on test objects, %", x_scale="log")
+    never = any(s == 0 for row in points.values() for s, _ in row)  # a policy that never touches
+    panel = Panel(
+        series,
+        x_label="seconds of touch a question",
+        y_label="right on test objects, %",
+        x_scale="symlog" if never else "log",
+    )
     return Picture(
         name="accuracy_over_seconds",
         title="Accuracy over seconds of touch",

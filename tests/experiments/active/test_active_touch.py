@@ -34,7 +34,7 @@ def test_a_shrunken_run_scores_every_plan_at_equal_seconds(tmp_path):
     charts = {"accuracy_over_seconds.svg", "first_touches.svg"}  # trajectories too, if the policy touches at all
     assert charts <= {path.name for path in (directory / "plots").iterdir()}
     headroom = [t for t in results["tables"] if t["title"].startswith("Headroom")]
-    assert len(headroom) == 2
+    assert len(headroom) == 3  # by probes, by the warm start, and where choices drop out
     every = next(t for t in results["tables"] if t["title"] == "Plans and policies")
     seconds = {row[0]: row[5] for row in every["rows"]}
     assert seconds["random_2"] == pytest.approx(2 * seconds["random"])
@@ -42,6 +42,9 @@ def test_a_shrunken_run_scores_every_plan_at_equal_seconds(tmp_path):
     assert np.isfinite([row[1] for row in every["rows"]]).all()
     programs = next(r for r in results["requirements"] if r["name"] == "programs of the step on turns")
     assert programs["measured"] == 1
+    missing = {row[0]: row for t in results["tables"] if t["title"] == "Where choices drop out" for row in t["rows"]}
+    assert missing["by_question_at_equal_seconds"][5] == pytest.approx(missing["chosen_2"][5])  # seconds
+    assert missing["by_question_at_equal_seconds"][4] is None  # contacts of a mixture
     agents = next(t for t in results["tables"] if t["title"] == "Agents of other libraries")
     assert agents["rows"][0][1].startswith("not run: ")
     assert {*(directory / "policies").glob("*/0")} == {
