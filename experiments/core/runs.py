@@ -86,9 +86,9 @@ def versions() -> dict[str, str]:
 
 
 def create(home: Path, description: dict[str, Any]) -> Path:
-    """Make `runs/NAME/STAMP` with its `config.json`; the stamp is the local time, made unique by a suffix."""
+    """Make `runs/NAME/STAMP` with its `config.json`; the stamp is the time in UTC, made unique by a suffix."""
     home.mkdir(parents=True, exist_ok=True)
-    stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+    stamp = datetime.datetime.now(datetime.UTC).strftime("%Y%m%d-%H%M%S")
     for suffix in ("", *(f"-{i:02d}" for i in range(2, 100))):
         directory = home / f"{stamp}{suffix}"
         with contextlib.suppress(FileExistsError):

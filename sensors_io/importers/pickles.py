@@ -25,6 +25,12 @@ from sensors_io.importers.keep import UnreadableError
 _DEPTH = 64
 """Lists and dictionaries inside one another: far above what data sets nest."""
 
+_HASHED = ("TUPLE", "TUPLE1", "TUPLE2", "TUPLE3", "FROZENSET")
+"""Operations whose result is hashed part by part."""
+
+_PARTS = 16
+"""Parts of a tuple for each operation of its pickle: without repetition there is at most one."""
+
 _SIMPLE = re.compile(r"[<>|=]?([biufc]\d{1,2}|[SU]\d{1,6})")
 """Names of the types whose values are plain bytes."""
 
@@ -164,12 +170,39 @@ def read_pickle(path: pathlib.Path) -> Any:
 def _load(stream: io.BytesIO) -> Any:
     """The object that follows, its stand-ins replaced by the arrays that they checked."""
     start = stream.tell()
-    for operations, (opcode, argument, _) in enumerate(pickletools.genops(stream), 1):
-        # the unpickler allocates a table as long as the greatest number that an object is remembered by
-        if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT") and int(argument or 0) > operations:
-            raise pickle.UnpicklingError(f"object {argument} is remembered after {operations} operations")
+    _check_sizes(stream)
     stream.seek(start)
     return _plain(_DataUnpickler(stream).load(), _DEPTH, {})
+
+
+def _check_sizes(stream: io.BytesIO) -> None:
+    """Refuse a program whose memory or time grows faster than its length.
+
+    The unpickler allocates a table as long as the greatest number that an object is remembered by.  The key of a
+    dictionary is hashed part by part, and a tuple that names another twice, which names a third twice, has 2ⁿ parts.
+    """
+    stack: list[int | None] = []  # parts of each object if it were hashed; `None` is a mark
+    memory: dict[int, int] = {}
+    for operations, (opcode, argument, _) in enumerate(pickletools.genops(stream), 1):
+        name, before = opcode.name, list(opcode.stack_before)
+        if name in ("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"):
+            number = len(memory) if name == "MEMOIZE" else int(argument or 0)
+            if number > operations:
+                raise pickle.UnpicklingError(f"object {number} is remembered after {operations} operations")
+            memory[number] = stack[-1] or 0
+            continue
+        taken = []
+        if pickletools.markobject in before:
+            while (part := stack.pop()) is not None:
+                taken.append(part)
+            before = before[: before.index(pickletools.markobject)]
+        taken += [stack.pop() or 0 for _ in before]
+        parts = 1 + sum(taken) if name in _HASHED else 1
+        if parts > _PARTS * operations:
+            raise PickleError(f"repeats a tuple {parts} times within tuples: must be written out")
+        made = {"MARK": None, "DUP": max(taken, default=1)}.get(name, parts)
+        found = memory[int(argument or 0)] if name in ("GET", "BINGET", "LONG_BINGET") else made
+        stack += [found] * len(opcode.stack_after)
 
 
 def _plain(data: Any, depth: int, done: dict[int, tuple[Any, Any]]) -> Any:

@@ -46,6 +46,8 @@ def state(build, *state):
 
 EMPTY = np.empty(0).__reduce__()[:2]
 TYPE = (np.dtype, ("f8", False, True))
+TWICE = functools.reduce(lambda part, _: (part, part), range(60), ())
+"""A tuple of twice the same tuple, sixty times: 2⁶⁰ copies of the innermost."""
 
 
 @pytest.mark.parametrize(
@@ -55,10 +57,8 @@ TYPE = (np.dtype, ("f8", False, True))
         (state(EMPTY, 1, (2,), np.dtype(object), False, [1]), "must hold as many"),
         (state(EMPTY, 1, (1 << 40,), np.dtype("f8"), False, b"\0" * 8), "must have 8796093022208 bytes"),
         (state(EMPTY, 1, (-1,), np.dtype("f8"), False, b""), "tuple of sizes"),
-        (
-            state(EMPTY, 1, functools.reduce(lambda t, _: (t, t), range(60), ()), np.dtype("f8"), False, b""),
-            "tuple of sizes",
-        ),
+        (state(EMPTY, 1, TWICE, np.dtype("f8"), False, b""), "repeats a tuple"),
+        (b"\x80\x02}" + pickle.dumps(TWICE, 2)[2:-1] + b"K\x01s.", "repeats a tuple"),  # a dictionary's key
         (state(TYPE, 3, "<", None, ("a",), {"a": (np.dtype("f8"), 99)}, 8, 8, 0), "structured"),
         (pickle.dumps(np.zeros(1, [("a", object)])), "V8"),
         (pickle.dumps([0])[:-1] + b"r\xff\xff\xff\x7f.", "remembered"),
@@ -93,7 +93,7 @@ def test_arrays_of_every_order_and_type_come_back(tmp_path):
         np.array(["a", "bc"]),
         np.bool_(1),
     ]
-    nested = np.array([{"a": np.arange(2)}, None], object)
+    nested = np.array([{("a", (2, 3)): np.arange(2), "b": [(5, 6)] * 3}, None], object)
     for protocol in (0, 2, 4, 5):
         (tmp_path / "a.pkl").write_bytes(pickle.dumps([*data, np.empty(0), nested], protocol))
         *found, empty, objects = read_pickle(tmp_path / "a.pkl")
@@ -101,4 +101,4 @@ def test_arrays_of_every_order_and_type_come_back(tmp_path):
         assert (empty.shape, objects.shape, objects[1]) == ((0,), (2,), None)
         (tmp_path / "a.pkl").write_bytes(pickle.dumps(np.array([[1, 2], [3, None]], object, order="F"), protocol))
         assert read_pickle(tmp_path / "a.pkl").tolist() == [[1, 2], [3, None]]
-        np.testing.assert_array_equal(objects[0]["a"], [0, 1])
+        np.testing.assert_array_equal(objects[0][("a", (2, 3))], [0, 1])
