@@ -133,7 +133,7 @@ def accuracy_against_middle(
     colour: Mapping[str, str],
 ) -> bytes | None:
     """Draw accuracy over the rate of middle answers: a small dot per seed, a large mean; `None` if not measured."""
-    series = [s for name, row in arms.items() for s in _point(name, row, colour[name], "o")]
+    series = [s for name, row in arms.items() for s in _point(name, row, colour.get(name, SHARED), "o")]
     for (name, row), marker in zip(baselines.items(), itertools.cycle(MARKERS[1:]), strict=False):
         series += _point(name, row, SHARED, marker)
     x_label, y_label = f"{METRICS['middle_rate'].meaning} (%)", f"{METRICS['acc'].title} (%)"

@@ -28,13 +28,14 @@ def write_report(directory: Path, results: Results, *, about: str, description: 
 
     `about` is the docstring of the experiment, `description` the content of the run's `config.json`.
     """
-    colour, settings = colours(results.arms), dict(results.settings)
+    rows = read_metrics(directory)
+    colour, settings = colours(_charted(results.arms, rows)), dict(results.settings)
     smoke = description["scale"] == SMOKE
     middle, drawn = None, {}
     if results.arms:
         settings["seeds"] = len(next(iter(next(iter(results.arms.values())).values())).per_seed)
         middle = curves.accuracy_against_middle(results.arms, results.baselines, colour)
-        drawn = curves.draw_phases(read_metrics(directory), results.curves, colour)
+        drawn = curves.draw_phases(rows, results.curves, colour)
     plots = {f"{picture.name}.{picture.kind}": picture.content for picture in results.pictures}
     plots |= {f"curves_{phase}.svg": phase_curves.svg for phase, phase_curves in drawn.items()}
     plots |= {} if middle is None else {"accuracy_against_middle.svg": middle}
@@ -64,6 +65,12 @@ def write_report(directory: Path, results: Results, *, about: str, description: 
     path = directory / "report.html"
     write_text(path, page)
     return path
+
+
+def _charted(arms: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Arms with a curve or a rate of middle answers; others have no colour, so that ten colours serve more of them."""
+    curved = {"/".join(line["stage"].split("/")[1:-1]) for line in rows}
+    return [arm for arm, row in arms.items() if arm in curved or {"acc", "middle_rate"} <= row.keys()]
 
 
 def is_best(metric: str, arm: str, results: Results) -> bool:

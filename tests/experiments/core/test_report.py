@@ -179,8 +179,12 @@ def test_a_difference_is_bold_where_its_interval_excludes_zero(tmp_path, results
 def test_a_run_without_curves_rollouts_or_middle_rate_has_no_such_sections(tmp_path):
     arms = {"a": {"acc": Estimate(mean=1.0, ci95=(0.0, 2.0), per_seed=(1.0,))}}
     bare = Results(arms=arms, baselines={}, settings={"preset": "paper", "lr_scale": 1.0})
-    text = read(write_report(tmp_path, bare, about="Why?", description=DESCRIPTION).read_text()).text
-    assert not any(section in text for section in ("Training curves", "rollouts", "middle"))
+    page = write_report(tmp_path, bare, about="Why?", description=DESCRIPTION).read_text()
+    assert not any(section in read(page).text for section in ("Training curves", "rollouts", "middle"))
+    assert 'class="swatch"' not in page  # an arm that no chart shows has no colour
+    rated = dataclasses.replace(bare, arms={"a": {"acc": row(1.0)["acc"]}, "b": row(2.0)})
+    page = write_report(tmp_path, rated, about="Why?", description=DESCRIPTION).read_text()
+    assert re.findall(r'class="swatch"[^>]*></span>(\w)', page) == ["b", "b"]  # in both tables of scores
 
 
 def test_figures_with_intervals_are_figures_and_a_missing_one_is_no_word():
