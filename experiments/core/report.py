@@ -50,7 +50,7 @@ def write_report(directory: Path, results: Results, *, about: str, description: 
         settings=settings,
         verdict=() if smoke else results.verdict,
         requirements=() if smoke else results.requirements,
-        data=results.data,
+        data={name: value for name, value in results.data.items() if not isinstance(value, Mapping)},
         data_title="Data and time",
         results=results,
         colour=colour,
@@ -112,9 +112,7 @@ def render(
 
 def cell_text(cell: Cell, column: Column) -> str:
     """A cell of a table as it is shown."""
-    if isinstance(cell, bool):
-        return "yes" if cell else "no"
-    return cell if isinstance(cell, str) else number(cell, column.format if isinstance(cell, float) else ",")
+    return number(cell, column.format) if isinstance(cell, float | None) else plain(cell)
 
 
 def word_columns(table: Table) -> list[bool]:

@@ -52,7 +52,9 @@ def plain(value: object) -> str:
     """A setting or a count in words."""
     if isinstance(value, float):
         return number(value, ",.4g")
-    if isinstance(value, int) and not isinstance(value, bool):
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
         return number(value, ",")
     if isinstance(value, Mapping):
         return ", ".join(f"{key} {plain(item)}" for key, item in value.items())

@@ -95,7 +95,7 @@ def measure(
     """Make each workload, run it twice, time it, and go on to the next."""
     timed = {}
     for name, make in context.each(title, makers.items(), still=True):
-        with context.timed(re.sub(r"\W+", "_", name)):
+        with context.timed(re.sub(r"\W+", " ", name)):
             workload = make()
             _warm(workload.call)
             seconds = interleaved({name: workload.call}, context.rounds(f"timing {name}", rounds))[name]

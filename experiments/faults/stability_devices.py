@@ -27,6 +27,7 @@ from experiments.core.charts import Panel, Rule, Series, draw
 from experiments.core.context import Context
 from experiments.core.results import Picture, Requirement, Results, Table, at_most, named_table
 from experiments.core.runner import Experiment
+from experiments.core.text import plain
 from experiments.faults import live_viewing as viewing
 from experiments.faults import tac3d_recordings as tac3d
 from experiments.faults.replayed_camera import NoiseCamera, ReplayOutcome, replay_camera
@@ -99,8 +100,8 @@ def run(config: DeviceStabilityConfig, context: Context) -> Results:
         settings={
             "samples": round(config.seconds * RATE_HZ),
             "pictures": f"{config.size_px[0]} × {config.size_px[1]}",
-            "faults": f"{FAULTS.drop_share:.1%} drops, {FAULTS.duplicate_share:.1%} duplicates, jitter "
-            f"{1e3 * FAULTS.jitter_s:g} ms, {1e6 * FAULTS.skew:g} ppm, away {tuple(AWAY_S.values())} s",
+            "faults": f"{100 * FAULTS.drop_share:g} % drops, {100 * FAULTS.duplicate_share:g} % duplicates, jitter "
+            f"{1e3 * FAULTS.jitter_s:g} ms, clock {1e6 * FAULTS.skew:g} ppm fast, away {plain(list(AWAY_S.values()))} s",
             "vendor's recordings": ", ".join(c.name for c in checks) or "no --data-dir",
             "vendor's parser installed": tac3d.YAML,
         },
@@ -113,7 +114,7 @@ def replay_whole(name: str, camera: NoiseCamera, seconds: float, context: Contex
     capacity, every = (16, 24) if name == SLOW else (256, 1)
     faults = injected(seconds, hidden=name == BY_STAMPS)
     progress = context.progress_callback(f"device time {name}, s")
-    with context.timed(name.replace(" ", "_")), progress as report, warnings.catch_warnings():
+    with context.timed(name), progress as report, warnings.catch_warnings():
         warnings.simplefilter("ignore", OverloadWarning)  # intended, and counted
         return replay_camera(camera, seconds, faults, capacity=capacity, every=every, report=report)
 
@@ -187,8 +188,8 @@ def account_table(outcomes: Mapping[str, ReplayOutcome]) -> Table:
         rows,
         formats=dict.fromkeys(late, ".2f"),
         units=dict.fromkeys(late, "ms"),
-        note="Losses before the first sample and after the last are left out, for they cannot be noticed. Late: stamps "
-        "after the device's true time; by running minimum where the device gives its clock, else at arrival.",
+        note="Losses before the first sample and after the last are left out, for they cannot be noticed. Late: time from "
+        "when a sample was taken to its stamp, which is that of its arrival where the device gives no clock.",
     )
 
 

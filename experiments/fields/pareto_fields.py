@@ -88,7 +88,7 @@ def run(config: FieldsConfig, context: Context) -> Results:
     parts: list[ReportPart] = []
     for name, measure in context.each("sections", measured.items()):
         context.print(name)
-        with context.timed(name.replace(", ", "_").replace(" ", "_")):
+        with context.timed(name):
             parts += measure()
     return assemble(parts, {"recordings": "none" if root is None else "read", "cores": 1})
 

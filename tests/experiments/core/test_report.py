@@ -199,6 +199,8 @@ def test_pairs_of_a_metric_are_together_and_a_column_without_figures_is_left_out
     assert page.count('<tr class="first">') == 2
     assert "<th>95 % over objects</th>" not in page
     assert "nested" not in page
+    assert "Quantity" in page
+    assert "Quantity" not in write(tmp_path, dataclasses.replace(results, data={"nested": {"a": 1}}))
 
 
 def test_the_sign_of_zero_shows_in_an_interval_alone():
