@@ -100,8 +100,9 @@ def run(config: DeviceStabilityConfig, context: Context) -> Results:
         settings={
             "samples": round(config.seconds * RATE_HZ),
             "pictures": f"{config.size_px[0]} × {config.size_px[1]}",
-            "faults": f"{100 * FAULTS.drop_share:g} % drops, {100 * FAULTS.duplicate_share:g} % duplicates, jitter "
-            f"{1e3 * FAULTS.jitter_s:g} ms, clock {1e6 * FAULTS.skew:g} ppm fast, away {plain(list(AWAY_S.values()))} s",
+            "faults": f"{100 * FAULTS.drop_share:g} % drops, {100 * FAULTS.duplicate_share:g} % duplicates, "
+            f"jitter {1e3 * FAULTS.jitter_s:g} ms, clock {1e6 * FAULTS.skew:g} ppm fast, "
+            f"away {plain(list(AWAY_S.values()))} s",
             "vendor's recordings": ", ".join(c.name for c in checks) or "no --data-dir",
             "vendor's parser installed": tac3d.YAML,
         },
@@ -188,8 +189,8 @@ def account_table(outcomes: Mapping[str, ReplayOutcome]) -> Table:
         rows,
         formats=dict.fromkeys(late, ".2f"),
         units=dict.fromkeys(late, "ms"),
-        note="Losses before the first sample and after the last are left out, for they cannot be noticed. Late: time from "
-        "when a sample was taken to its stamp, which is that of its arrival where the device gives no clock.",
+        note="Losses before the first sample and after the last are left out, for they cannot be noticed. Late: time "
+        "from when a sample was taken to its stamp, which is that of its arrival where the device gives no clock.",
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from experiments.core.charts import Panel, Rule, Series, draw
 from experiments.core.look import PALETTE, SHARED
 from experiments.core.results import Picture, Table, at_most, named_table
+from experiments.core.text import number
 from experiments.fields.sections import ReportPart
 from sensors_io.fields.deformation import LOST_SHARE
 from sensors_io.schema import Flag
@@ -97,15 +98,16 @@ def break_table(field: StressedField, outcomes: StressOutcomes) -> Table:
         broken = [(level, o) for level in field.stresses[stress] for o in by_level[stress, level] if o.broken]
         if not broken:
             return "–"
-        names = (" + ".join(str(f.name).lower() for f in Flag if f & o.flags) or "silent" for _, o in broken)
+        words = {flag: str(flag.name).lower().replace("_", " ") for flag in Flag}
+        names = (" + ".join(word for f, word in words.items() if f & o.flags) or "silent" for _, o in broken)
         counts = collections.Counter(names)
-        return f"{broken[0][0]:.3g}: " + ", ".join(f"{name} {count}" for name, count in counts.items())
+        return f"{number(broken[0][0])}: " + ", ".join(f"{name} {count}" for name, count in counts.items())
 
     return named_table(
         f"Where {field.name} breaks first",
         [{"method": m, **{s: cell(by_level, s) for s in field.stresses}} for m, by_level in outcomes.items()],
         note="First level at which any gel and motion breaks; then the number of broken frames over all levels by the "
-        "flags that they carry.",
+        "flags that they carry; silent frames carry none.",
     )
 
 
@@ -140,7 +142,7 @@ def _curves(field: StressedField, outcomes: StressOutcomes) -> bytes:
             y_label="" if i % 4 else f"error, {field.unit}",
             y_scale="log",
             y_limits=(0.01 * tolerance, 130 * tolerance),
-            x_ticks={x: f"{level:.3g}" for x, level in enumerate(levels)},
+            x_ticks={x: number(level) for x, level in enumerate(levels)},
             rules=[Rule(y=tolerance)],
         )
         panels.append(panel)

@@ -10,6 +10,7 @@ import numpy as np
 from experiments.core.charts import Panel, Rule, Series, draw, estimates
 from experiments.core.look import PALETTE, SHARED
 from experiments.core.results import Cell, Picture, Table, named_table
+from experiments.core.text import number
 from experiments.mechanics.identify_motions import MotionData
 from experiments.mechanics.identify_presses import PressData
 from experiments.mechanics.identify_probes import (
@@ -180,7 +181,8 @@ def tier_table(studied: StudyPredictions) -> Table:
             **ENDS,
             **dict.fromkeys(SOURCES, "lost by it"),
         },
-        "The same presses with the same noise at every tier; a coarse grid leaves out short waves of the skin.",
+        "The same presses with the same noise at every tier, which is named by the points of its grid and a looser "
+        "tolerance of the solver; springs do not act on each other. A coarse grid leaves out short waves of the skin.",
         in_points=("lost", "from", "to", *SOURCES),
     )
 
@@ -266,7 +268,7 @@ def tier_picture(studied: StudyPredictions) -> Picture:
                 x_label="points lost",
                 x_scale="symlog",
                 linear_to=LINEAR_POINTS,
-                x_ticks={float(tick): f"{tick:g}" for tick in (-5, -2, 0, 2, 5, 10, 20, 50)},
+                x_ticks={float(tick): number(tick) for tick in (-5, -2, 0, 2, 5, 10, 20, 50)},
                 rows=tiers,
                 rules=[Rule(x=0, line="-", colour=SHARED, width=0.8), Rule(x=MAY_LOSE, colour=SHARED)],
             )
@@ -274,8 +276,8 @@ def tier_picture(studied: StudyPredictions) -> Picture:
     return Picture(
         name="label_transfer",
         title="Loss by a cheaper contact",
-        caption="Points lost about exact records by training at a tier, mean over sensors with 95 % interval; dots are "
-        f"single sensors, the dotted line is the greatest loss allowed, {MAY_LOSE:g} points.",
+        caption="Points lost on exact records by training on those of a cheaper contact, mean over sensors with 95 % "
+        f"interval; dots are single sensors. Dotted: the greatest loss allowed, {MAY_LOSE:g} points; orange: exceeded.",
         content=draw(panels, share_x=True, share_y=True, size=(9.7, 0.9 + 0.36 * len(tiers))),
     )
 

@@ -29,4 +29,4 @@ def test_the_package_must_not_break_silently(mild, silent):
 
 def test_a_method_breaks_first_at_its_lowest_broken_level():
     found = outcomes(this={1: [GOOD], 2: [FLAGGED]}, theirs={1: [SILENT, GOOD], 2: [SILENT, GOOD]})
-    assert break_table(NOISE, found).rows == (("this", "2: marker_loss 1"), ("theirs", "1: silent 2"))
+    assert break_table(NOISE, found).rows == (("this", "2: marker loss 1"), ("theirs", "1: silent 2"))
