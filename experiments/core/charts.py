@@ -33,12 +33,9 @@ from matplotlib.ticker import LogLocator, NullFormatter, NullLocator, StrMethodF
 from experiments.core.look import LOOK, MARKERS, PALETTE, SHARED, colours, svg
 from experiments.core.text import WithInterval, number
 
-LONG_AXIS = 300.0
-"""Ends of a logarithmic axis, one over the other, beyond which its ticks are powers of ten alone."""
-
-ITERATIONS = 200
-"""Of the placement of labels; a limit in seconds would make a picture depend on the machine."""
-
+LONG_AXIS = 300.0  # ends of a logarithmic axis, one over the other, beyond which its ticks are powers of ten alone
+ITERATIONS = 200  # of the placement of labels; a limit in seconds would make a picture depend on the machine
+LETTERS = 13  # an inch, of a tick or a legend
 STROKES, STROKE = ("|", "_", "x", "+"), 1.5  # markers without an area, width of their lines in points
 BEHIND = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}  # text, legible on lines that it crosses
 ROOM = 0.12  # for the figure at the end of the longest bar, over the length of the axis
@@ -48,8 +45,8 @@ Values = Sequence[float] | np.ndarray  # numbers [N]
 Scale = Literal["linear", "log", "symlog"]
 Better = Literal["lower", "higher"]
 
-BEATEN = "×: another one is as good on both axes and better on one"
-"""Title of a panel whose dominated points are crossed."""
+BEATEN = "×: dominated by another"
+"""Title of a panel with crosses on points, where another one is as good on both axes and better on one."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -183,7 +180,7 @@ def draw(
             axes.set_visible(False)
         entries = _entries(panels) if legend else {}
         if entries:
-            wide = int(figure.get_figwidth() * 13) // (max(map(len, entries)) + 6)  # some 13 letters an inch
+            wide = int(figure.get_figwidth() * LETTERS) // (max(map(len, entries)) + 6)
             figure.legend(list(entries.values()), list(entries), loc="outside upper left", ncols=max(1, wide))
         if any(series.labels for panel in panels for series in panel.series):
             figure.draw_without_rendering()  # settles the layout, which ignores labels
@@ -354,14 +351,17 @@ def _draw_rule(axes: Axes, rule: Rule) -> None:
 
 
 def _set_ticks(axis: Axis, scale: Scale, ticks: Mapping[float, str] | None, form: str = "") -> None:
-    """The ticks given, else matplotlib's; on a short logarithmic axis also 2 and 5 times the powers of ten."""
+    """The ticks given, else matplotlib's; on a short logarithmic axis 2 and 5 times the powers of ten too, if they fit."""
     if ticks is not None:
         axis.set_ticks(list(ticks), list(ticks.values()))
         axis.set_minor_locator(NullLocator())
         return
     if scale == "log":
         low, high = axis.get_view_interval()
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < LONG_AXIS * low else (1.0,)))
+        fine = LogLocator(subs=(1.0, 2.0, 5.0))
+        letters = sum(len(f"{tick:g}") for tick in fine.tick_values(low, high) if low <= tick <= high)
+        room = LETTERS * axis.axes.bbox.width / axis.axes.figure.dpi if axis is axis.axes.xaxis else math.inf
+        axis.set_major_locator(fine if high < LONG_AXIS * low and letters <= room else LogLocator(subs=(1.0,)))
         axis.set_minor_formatter(NullFormatter())
     if form or scale != "linear":
         axis.set_major_formatter(StrMethodFormatter(form or "{x:g}"))

@@ -322,7 +322,7 @@ def _equal_table(tasks: Mapping[str, Rows]) -> Table:
 
 
 def _speed_picture(tasks: Mapping[str, Rows]) -> Picture:
-    panels, x_label, y_label = [], "time a frame, ms", "relative error of the marker displacement"
+    panels, x_label, y_label = [], "time a frame, ms", "error of the marker displacement"
     for task, rows in tasks.items():
         series = []
         for kind in dict.fromkeys(row.kind for row in rows.values()):

@@ -262,9 +262,9 @@ def mark_levels(picture: np.ndarray, solid: objects.Solid) -> np.ndarray:
 DEFAULT = GalleryConfig()
 SMOKE = dataclasses.replace(
     DEFAULT,
-    views=4,
+    views=3,
     presses=1,
-    columns=4,
+    columns=3,
     varied=1,
     image_px=56,
     protocol=SceneConfig(objects=4, sequences=4 * 24, frames=20, contact_grid=32),

@@ -91,6 +91,14 @@ def test_dominated_choices_are_crossed():
     assert BEATEN not in texts(draw([line]))
 
 
+def test_ticks_of_a_narrow_logarithmic_axis_do_not_overlap():
+    panel = Panel([Series(x=[0.0015, 0.15], y=[0, 1])], x_scale="log")
+    assert "0.002" in texts(draw([panel]))
+    narrow = texts(draw([panel] * 5, columns=5, size=(11.0, 3.0)))
+    assert {"0.01", "0.1"} <= narrow
+    assert "0.002" not in narrow
+
+
 def test_a_heatmap_names_its_rows_columns_and_cells():
     shown = Heatmap(
         np.eye(2), rows=["low", "high"], columns=["left", "right"], title="t", cells=[["1", "2"], ["3", "4"]]
