@@ -351,7 +351,7 @@ def _draw_rule(axes: Axes, rule: Rule) -> None:
 
 
 def _set_ticks(axis: Axis, scale: Scale, ticks: Mapping[float, str] | None, form: str = "") -> None:
-    """The ticks given, else matplotlib's; on a short logarithmic axis 2 and 5 times the powers of ten too, if they fit."""
+    """The ticks given, else matplotlib's; on a short logarithmic axis 2 and 5 times powers of ten too, if they fit."""
     if ticks is not None:
         axis.set_ticks(list(ticks), list(ticks.values()))
         axis.set_minor_locator(NullLocator())

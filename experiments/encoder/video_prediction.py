@@ -60,10 +60,10 @@ SCORE_BATCH = 8  # contacts that are scored at once; a clip of 8 frames by four 
 OPTIMIZER = OptimizerConfig(learning_rate=1e-5, lr_scale=200.0)
 
 METRICS = {
-    "l1": "mean absolute difference of pixels in [0, 1]",
-    "ssim": "structural similarity, 11 × 11 Gaussian window, higher is better",
-    "encoder_distance": "mean absolute difference of a tactile encoder's patch tokens; no published metric",
-    "lpips": "AlexNet, with the given weights",
+    "L1": "mean absolute difference of pixels in [0, 1]",
+    "SSIM": "structural similarity, 11 × 11 Gaussian window, higher is better",
+    "encoder distance": "mean absolute difference of a tactile encoder's patch tokens; no published metric",
+    "LPIPS": "AlexNet, with the given weights",
 }
 
 
@@ -174,13 +174,13 @@ def frame_metrics(encoder: TactileViTConfig, params: Params, lpips_weights: Path
 
     def score(predicted: np.ndarray, target: np.ndarray, batch: TouchBatch) -> dict[str, np.ndarray]:
         found = {
-            "l1": np.abs(predicted - target).mean((-3, -2, -1)),
-            "ssim": ssim(predicted, target),
-            "encoder_distance": np.asarray(distance(params, predicted, target, batch)),
+            "L1": np.abs(predicted - target).mean((-3, -2, -1)),
+            "SSIM": ssim(predicted, target),
+            "encoder distance": np.asarray(distance(params, predicted, target, batch)),
         }
         if weights:
             flat = lambda x: jnp.asarray(x).reshape(-1, *x.shape[-3:])
-            found["lpips"] = np.asarray(perceptual(flat(predicted), flat(target))).reshape(predicted.shape[:2])
+            found["LPIPS"] = np.asarray(perceptual(flat(predicted), flat(target))).reshape(predicted.shape[:2])
         return found
 
     return score
@@ -281,7 +281,7 @@ def report(
     config: VideoPredictionConfig, data: Dataset, scores: Mapping[str, FrameScores], objects: np.ndarray, grid: bytes
 ) -> Results:
     """Skill of each predictor and skip, tables of all metrics, a grid of frames."""
-    l1 = lambda name, skip: scores[name].mean("l1", skip, 1)
+    l1 = lambda name, skip: scores[name].mean("L1", skip, 1)
     skills = {
         (name, s): skill(l1(name, s), l1(COPY, s), objects) for name in (TOUCH, VISION, MEAN) for s in config.skips
     }
@@ -341,29 +341,29 @@ def score_table(
 
 def paper_table(config: VideoPredictionConfig, scores: Mapping[str, FrameScores]) -> Table:
     """The predictors and baselines, and the paper's rows for its own recordings."""
-    columns = {"l1": "L1", "ssim": "SSIM", "lpips": "LPIPS"}
-    means = lambda found, s: {c: float(found.mean(m, s, 1).mean()) for m, c in columns.items() if m in found.values}
+    columns = ("L1", "SSIM", "LPIPS")
+    means = lambda found, s: {c: float(found.mean(c, s, 1).mean()) for c in columns if c in found.values}
     rows: list[dict[str, Cell]] = [
         {"method": f"{name}, {s} ahead", **means(found, s)} for s in config.skips for name, found in scores.items()
     ]
     for (name, s, inputs), values in paper.VIDEO.items():
-        cells = dict(zip(columns.values(), values, strict=True))
-        rows.append({"method": f"{name}: {inputs}, {s} ahead (paper)", **cells})
+        cells = dict(zip(columns, values, strict=True))
+        rows.append({"method": f"{name.replace('Ours', 'Touch-R1')}: {inputs}, {s} ahead (paper)", **cells})
     return named_table(
         "Comparison with the paper",
         rows,
-        formats=dict.fromkeys(columns.values(), ".3f"),
+        formats=dict.fromkeys(columns, ".3f"),
         meanings={"LPIPS": "only with weights given by the user"},
         note="Generated presses of 8 frames here, recorded press-and-slide videos there; no pretrained weights here. "
-        "The paper does not give the scale of its L1: a grey picture differs by at most .5 from pixels in [0, 1], so "
-        ".608 to .861 cannot be means of absolute differences on that scale. It has no row for copying the last frame "
-        "or for a mean frame.",
+        "The paper does not give the scale of its L1: a grey picture differs by at most 0.5 from pixels in [0, 1], so "
+        "0.608 to 0.861 cannot be means of absolute differences on that scale. It has no row for copying the last "
+        "frame or for a mean frame.",
     )
 
 
 def sensor_table(config: VideoPredictionConfig, data: Dataset, scores: Mapping[str, FrameScores]) -> Table:
     """L1 by sensor."""
-    columns = {f"{name}, {s}": scores[name].mean("l1", s, 0) for s in config.skips for name in (TOUCH, COPY, MEAN)}
+    columns = {f"{name}, {s}": scores[name].mean("L1", s, 0) for s in config.skips for name in (TOUCH, COPY, MEAN)}
     rows = [
         {"sensor": sensor, **{name: float(values[i]) for name, values in columns.items()}}
         for i, sensor in enumerate(data.clip.sensors)
