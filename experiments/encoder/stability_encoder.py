@@ -213,7 +213,7 @@ def report(config: StabilityEncoderConfig, outcomes: list[CollapseOutcome]) -> R
                 name="stability_encoder",
                 title="Runs into collapse",
                 caption="Held-out measurements, a thin line for each seed, a bold one for their median; dotted: the "
-                "bound of the alarm.",
+                "bound of the alarm; dashed: arms that add a guard against a collapse.",
                 content=collapse_chart(outcomes, config.block_steps),
             ),
         ),
@@ -243,7 +243,7 @@ def arm_table(config: StabilityEncoderConfig, outcomes: list[CollapseOutcome]) -
         rows,
         formats={"kept": ".2f", "rank": ".2f", "skill": ".2f", "probes": "+.1f"}
         | dict.fromkeys(("failed", "alarm", "at"), ".0f"),
-        units={"probes": "pts", "failed": "%", "alarm": "%", "at": "step"},
+        units={"probes": "points", "failed": "%", "alarm": "%", "at": "step"},
         meanings={
             "kept": "spread between contacts over that before training, median",
             "rank": "effective rank over width, median over seeds",

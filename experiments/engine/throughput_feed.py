@@ -30,6 +30,7 @@ from experiments.core.context import Context
 from experiments.core.loops import run_loop
 from experiments.core.results import Picture, Results, Table, at_most, named_table
 from experiments.core.runner import Experiment
+from experiments.core.text import plain
 from experiments.engine.matrix_floor import count_flops
 from experiments.paper import presets
 from experiments.study import study as studies
@@ -127,7 +128,7 @@ def run(config: FeedingConfig, context: Context) -> Results:
             Picture(
                 name="cores",
                 title="Cores that a device needs for its batches",
-                caption="Processor time of a batch over the predicted time of a step; the dotted line is what it has.",
+                caption="Processor time of a batch over the predicted time of a step; dotted: cores beside a device.",
                 content=bars({one.name: one.cores for one in fed}, "cores", bounds=(config.cores,), logarithmic=True),
             ),
         ),
@@ -339,8 +340,8 @@ def feed_table(config: FeedingConfig, fed: Sequence[FeedMeasurement]) -> Table:
             "step": "predicted",
             "cores needed": f"of {config.cores} beside a device",
         },
-        note=f"Steps are as short as {config.machine.flops_share:.0%} of {config.machine.flops / 1e12:.0f} TFLOP/s "
-        "make them.",
+        note=f"A step takes the time of its arithmetic at {100 * config.machine.flops_share:.0f} % of "
+        f"{plain(config.machine.flops / 1e12)} TFLOP/s.",
     )
 
 
