@@ -4,7 +4,6 @@ Reports are made in other modules: importing them would add to the memory of the
 """
 
 import dataclasses
-import re
 import resource
 import statistics
 import time
@@ -95,7 +94,7 @@ def measure(
     """Make each workload, run it twice, time it, and go on to the next."""
     timed = {}
     for name, make in context.each(title, makers.items(), still=True):
-        with context.timed(re.sub(r"\W+", " ", name)):
+        with context.timed(name):
             workload = make()
             _warm(workload.call)
             seconds = interleaved({name: workload.call}, context.rounds(f"timing {name}", rounds))[name]

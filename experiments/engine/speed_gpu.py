@@ -182,12 +182,12 @@ def memory_table(reserved: int, counted: int, device: jax.Device) -> Table:
     """Bytes of a GRPO step: counted, reserved by the compiler, and the allocator's peak so far."""
     figures = {
         "counted by hand": counted,
-        "XLA's compiler: arguments and what passes": reserved,
+        "XLA's compiler: arguments and temporaries": reserved,
         "the allocator's peak in this process": (device.memory_stats() or {}).get("peak_bytes_in_use"),
     }
     return named_table(
         "Memory of a GRPO step",
-        [{"who says so": name, "memory": None if size is None else size / GB} for name, size in figures.items()],
+        [{"source": name, "memory": None if size is None else size / GB} for name, size in figures.items()],
         units={"memory": "GB"},
         note="The allocator has seen all pieces; the step is the largest of them.",
     )
