@@ -198,6 +198,10 @@ def test_pairs_of_a_metric_are_together_and_a_column_without_figures_is_left_out
     page = write(tmp_path, dataclasses.replace(results, comparisons=tuple(mixed), data={"nested": {"a": 1}, "n": 2}))
     assert page.count('<tr class="first">') == 2
     assert "<th>95 % over objects</th>" not in page
+    paired = [dataclasses.replace(c, over="objects", p_value=None) for c in mixed]
+    page = write(tmp_path, dataclasses.replace(results, comparisons=tuple(paired), data={"nested": {"a": 1}, "n": 2}))
+    assert "<th>95 % over objects</th>" in page
+    assert "over seeds</th>" not in page
     assert "nested" not in page
     assert "Quantity" in page
     assert "Quantity" not in write(tmp_path, dataclasses.replace(results, data={"nested": {"a": 1}}))
