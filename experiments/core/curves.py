@@ -20,7 +20,7 @@ POINTS_OF_CHART = 25_000
 FEWEST_POINTS = 25
 
 WORDS = {
-    "degenerate_share": "share of groups whose rewards are all equal",
+    "degenerate_share": "groups whose rewards are all equal",
     "echo_share": "share of answers with one level in all slots",
     "entropy": "entropy (nat a token)",
     "grounding": "KL to the answers without a stream (nat)",

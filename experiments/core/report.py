@@ -68,9 +68,10 @@ def write_report(directory: Path, results: Results, *, about: str, description: 
 
 
 def _charted(arms: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Arms with a curve or a rate of middle answers; others have no colour, so that ten colours serve more of them."""
-    curved = {"/".join(line["stage"].split("/")[1:-1]) for line in rows}
-    return [arm for arm, row in arms.items() if arm in curved or {"acc", "middle_rate"} <= row.keys()]
+    """Arms with a curve or a rate of middle answers, in the tables' order; for all others ten colours are too few."""
+    curved = dict.fromkeys("/".join(line["stage"].split("/")[1:-1]) for line in rows)
+    shown = [arm for arm, row in arms.items() if arm in curved or {"acc", "middle_rate"} <= row.keys()]
+    return shown + [arm for arm in curved if arm and arm not in shown]
 
 
 def is_best(metric: str, arm: str, results: Results) -> bool:

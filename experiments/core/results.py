@@ -232,7 +232,7 @@ class Results:
         experiment has none.
       comparisons: paired differences between arms.
       data, timing: sizes of the data, seconds; anything that JSON can hold.
-      curves: phase → names of the logged scalars to draw; a phase not named is drawn whole.
+      curves: phase → names of the logged scalars to draw, over those of the experiment.
       examples: a few rollouts; they go into the report, not into `results.json`.
 
     Raises:

@@ -114,7 +114,7 @@ class Experiment(Generic[C]):
       config: the default configuration, a frozen keyword-only dataclass.
       run: computes the results; it skips stages for which `Context.done` is true and continues from checkpoints.
       scales: further configurations by name, `smoke` for one that takes under two minutes.
-      curves: phase → scalars to draw while it runs; of a phase that is not named, the first few.
+      curves: phase → scalars to draw; of a phase that is not named all, the first few while it runs.
       needs: scale → accelerators that it needs; a scale that is not named runs on any machine.
       quick: scales whose programs run so few times that they are compiled quickly.
       spreads: whether its training runs on the devices of all processes; others use one device.
@@ -371,7 +371,8 @@ def _compute(
         with contextlib.closing(context), context.timed("total"), page.kept_fresh():
             results = experiment.run(command.config, context)
         tables = (*results.tables, *left_out_tables(read_metrics(directory)))
-        results = dataclasses.replace(results, timing={**context.timing(), **results.timing}, tables=tables)
+        timing, drawn = {**context.timing(), **results.timing}, {**experiment.curves, **results.curves}
+        results = dataclasses.replace(results, timing=timing, tables=tables, curves=drawn)
         report = write_report(directory, results, about=about, description=description)
         write_sealed(directory / "results.json", results.to_json(description))  # last: it marks the run as finished
         runs.point_latest(directory)  # of a run without a loop or a line

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from experiments.core.artifacts import write_text
+from experiments.core.look import PALETTE
 from experiments.core.report import is_best, pieces, word_columns, write_report
 from experiments.core.results import Comparison, Estimate, Picture, Results, Trace, named_table
 from experiments.core.text import MEANINGLESS, SMOKE, bounds, number
@@ -185,6 +186,15 @@ def test_a_run_without_curves_rollouts_or_middle_rate_has_no_such_sections(tmp_p
     rated = dataclasses.replace(bare, arms={"a": {"acc": row(1.0)["acc"]}, "b": row(2.0)})
     page = write_report(tmp_path, rated, about="Why?", description=DESCRIPTION).read_text()
     assert re.findall(r'class="swatch"[^>]*></span>(\w)', page) == ["b", "b"]  # in both tables of scores
+
+
+def test_arms_that_have_curves_alone_have_colours_of_their_own(tmp_path):
+    lines = [f'{{"stage": "grpo/{arm}/0", "step": 0, "loss": 1}}\n' for arm in ("a", "a-100", "a-400")]
+    write_text(tmp_path / "metrics.jsonl", "".join(lines))
+    settings = {"preset": "paper", "lr_scale": 1.0}
+    write_report(tmp_path, Results(arms={"a": row(1.0)}, settings=settings), about="Why?", description=DESCRIPTION)
+    drawn = (tmp_path / "plots" / "curves_grpo.svg").read_text()
+    assert all(colour in drawn for colour in PALETTE[:3])
 
 
 def test_figures_with_intervals_are_figures_and_a_missing_one_is_no_word():
