@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments.core.charts import Panel, Series, draw
-from experiments.core.look import MARKERS, SHARED, colours
+from experiments.core.look import MARKERS, PALETTE, SHARED, colours
 from experiments.core.results import Estimate
 from touchr1_jax.bench.metrics import METRICS
 
@@ -133,11 +133,13 @@ def accuracy_against_middle(
     colour: Mapping[str, str],
 ) -> bytes | None:
     """Draw accuracy over the rate of middle answers: a small dot per seed, a large mean; `None` if not measured."""
-    series = [s for name, row in arms.items() for s in _point(name, row, colour.get(name, SHARED), "o")]
+    series, size = [], (6.6, 3.2 + 0.09 * len({**arms, **baselines}))  # with room for the legend
+    for i, (name, row) in enumerate(arms.items()):  # from the eleventh arm on, colours return with other markers
+        series += _point(name, row, colour.get(name, SHARED), MARKERS[i // len(PALETTE) % len(MARKERS)])
     for (name, row), marker in zip(baselines.items(), itertools.cycle(MARKERS[1:]), strict=False):
         series += _point(name, row, SHARED, marker)
     x_label, y_label = f"{METRICS['middle_rate'].meaning} (%)", f"{METRICS['acc'].title} (%)"
-    return draw([Panel(series, x_label=x_label, y_label=y_label)], size=(6.6, 3.9)) if series else None
+    return draw([Panel(series, x_label=x_label, y_label=y_label)], size=size) if series else None
 
 
 def _point(name: str, row: Mapping[str, Estimate], colour: str, marker: str) -> list[Series]:
