@@ -20,6 +20,7 @@ import numpy as np
 from experiments.core.artifacts import DamagedFileError, read_json
 from experiments.core.context import Context, MetricLog, read_metrics
 from experiments.core.runs import read_description
+from experiments.faults.damaged_files import SAME as SAME_END
 from experiments.faults.damaged_files import Damage, end_of_run, telling_line
 from experiments.faults.fixtures import flip_bit
 from experiments.faults.kills import PRINTED, KillableTraining, Session
@@ -100,6 +101,8 @@ def go_on_flipped(
             if home / one.path in left:
                 flip_bit(home / one.path, one.bit)
         outcome = end_of_run(home / training.name, code, output, wanted)
+        if group is together and outcome != SAME_END:
+            outcome = WRONG  # even a named error: reading said that these bits change nothing
         yield Damage(file=name, damage="a random bit flipped", outcome=outcome, message=telling_line(output, scratch))
         shutil.rmtree(home)
 
@@ -185,7 +188,7 @@ READERS: tuple[tuple[str, Callable[[Path], str]], ...] = (
     (r"/metrics\.jsonl$", _log),
     (r"/answers/[^/]*\.npz$", _answers),
     (r"/(sft|grpo)/[^/]*\.npz$", lambda path: digest(read_policy(path))),
-    (r"/scenes-[^/]*/[^/]*\.(json|arrayrecord)$", _records),
+    (r"/scenes-[^/]*/(index\.[^/]*|[^/]*\.arrayrecord)$", _records),
     (r"/policies/.*\.(json|safetensors)$", _saved_policy),
     (r"/config\.json$", lambda path: digest(read_description(path.parent))),
     (r"\.json$", lambda path: digest(read_json(path))),

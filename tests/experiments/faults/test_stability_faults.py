@@ -1,6 +1,7 @@
 """Requirements and tables from known parts, and, slowly, the experiment as a whole."""
 
 import dataclasses
+import shutil
 
 import pytest
 
@@ -11,6 +12,7 @@ from experiments.faults.fixtures import unfinished_run
 from experiments.faults.flipped_bits import FOUND, RAW, Flip
 from experiments.faults.kills import START, STEPPING, Kill
 from experiments.faults.stability_faults import GRPO, KilledRuns, WaitingConfig, damage_table, kill_table, requirements
+from sensors_io.index import TABLES
 from tests.experiments import tiny
 from tests.experiments.encoder.test_pretrain import PRETRAIN
 from tests.experiments.shrunk import run_shrunk
@@ -60,6 +62,13 @@ def test_a_save_that_was_cut_off_is_of_no_kind_that_is_read(tmp_path, context):
     half.write_bytes(b"half")
     (flip,) = flipped_bits.flip_bits(tmp_path / "run", tmp_path, context, count=1)
     assert flip.reading == flipped_bits.SAME
+
+
+def test_a_flipped_bit_of_records_is_found_or_changes_nothing(tmp_path, records, context):
+    shutil.copytree(records, tmp_path / "run" / "scenes-1")
+    flips = list(flipped_bits.flip_bits(tmp_path / "run", tmp_path, context, count=60))
+    assert {flip.reading for flip in flips} == {flipped_bits.SAME, FOUND}
+    assert {flip.file for flip in flips} > {f"scenes-…/index.{table}" for table in TABLES}
 
 
 @pytest.mark.slow
