@@ -157,9 +157,11 @@ def read_policy(folder: Path) -> SavedPolicy:
             if not (folder / name).is_file() or _sha256((folder / name).read_bytes()) != config["files"][name]:
                 raise PolicyError(f"policy is {folder}: {name} is missing or damaged; copy the folder again")
         notes = {**config["notes"]}
-        model, language = rebuilt(ModelConfig, config["model"]), rebuilt(Language, config["language"])
-        known = {"show": PolicyInput.show, **config["input"]}  # those saved before it could be chosen see pictures
-        reads, questions = rebuilt(PolicyInput, known), dict(config["questions"])
+        # policies saved before these could be chosen read pictures, and the pixels of a view
+        sizes = {**config["model"], "vision": {"stem": "pixels", **config["model"]["vision"]}}
+        shown = {"show": PolicyInput.show, **config["input"]}
+        model, language = rebuilt(ModelConfig, sizes), rebuilt(Language, config["language"])
+        reads, questions = rebuilt(PolicyInput, shown), dict(config["questions"])
         vocabulary = json.loads((folder / TOKENIZER_FILE).read_text(encoding="utf-8"))["model"]["vocab"]
         words = sorted(vocabulary, key=vocabulary.__getitem__)[len(word_library(()).get_vocab()) :]
         policy = assemble_policy(model, language, word_tokenizer(words), questions)

@@ -4,7 +4,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from touchr1_jax.models.frame_statistics import TINY, WIDTH, frame_statistics, scaled_statistics
+from touchr1_jax.models.frame_statistics import (
+    TINY,
+    VIEW_CENTRE,
+    VIEW_SPREAD,
+    WIDTH,
+    frame_statistics,
+    scaled_statistics,
+    view_statistics,
+)
 
 FRAMES = np.random.default_rng(0).integers(0, 256, (2, 3, 16, 24, 3), np.uint8)
 """Two streams of three frames of 16 × 24 px: six patches of 8 px."""
@@ -43,6 +51,16 @@ def test_scaled_statistics_hold_the_patch_and_the_mean_patch():
     np.testing.assert_array_equal(found[:, :, 0, 21:], found[:, :, 5, 21:])
     change = (FRAMES[1, 2].astype(np.float64) - FRAMES[1, 0]).mean((0, 1)) / 255
     np.testing.assert_allclose(found[1, 2, 0, 21:24], change / 0.03, atol=1e-4)
+
+
+def test_statistics_of_a_view_are_colour_and_gradients_of_the_cell_and_the_mean_cell():
+    view = FRAMES[0, 1]
+    found = np.asarray(view_statistics(jnp.asarray(view), 8))
+    assert found.shape == (6, 18)
+    gradients = by_hand(FRAMES[0, 1:2], 8, 16, (8, 8))[0, 9:15]
+    expected = np.concatenate([view[8:, 16:].mean((0, 1)) / 255, gradients])
+    np.testing.assert_allclose(found[5, :9], (expected - VIEW_CENTRE) / VIEW_SPREAD, atol=2e-4)
+    np.testing.assert_allclose(found[2, 9:12], (view.mean((0, 1)) / 255 - VIEW_CENTRE[:3]) / VIEW_SPREAD[:3], atol=2e-4)
 
 
 @pytest.mark.parametrize("patch_px", [6, 4, 10])

@@ -48,6 +48,20 @@ def test_pixels_keep_their_place_inside_a_patch():
     assert not jnp.delete(difference, row, axis=0).any()
 
 
+def test_statistics_see_where_a_pixel_is_by_its_cell_alone():
+    tower = VisionTower(dataclasses.replace(CONFIG, stem="statistics"), 12)
+    params = draw_params(jax.eval_shape(tower.init, jax.random.key(0), jnp.zeros((16, 16, 3), jnp.uint8)))
+    run = jax.jit(lambda x: tower.apply(params, x))
+    view = np.full((16, 16, 3), 100, np.uint8)
+    seen = [view.copy() for _ in range(3)]
+    for one, (y, x) in zip(seen, [(2, 2), (5, 5), (10, 2)], strict=True):
+        one[y, x] += 50
+    same, moved, other = (np.asarray(run(one)) for one in seen)
+    assert same.shape == (4, 12)
+    np.testing.assert_allclose(same, moved, atol=1e-5)
+    assert not np.allclose(same, other, atol=1e-3)
+
+
 def test_grid_is_the_tokens_along_one_side():
     assert VisionConfig().grid == 2
     assert VisionConfig(image_px=112, patch_px=14).grid == 4
