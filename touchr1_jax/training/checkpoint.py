@@ -10,6 +10,7 @@ import itertools
 import json
 import logging
 import math
+import shutil
 import sys
 import threading
 import zlib
@@ -32,6 +33,9 @@ _STAMPED = "_CHECKPOINT_METADATA"
 
 MOST_SAID = 240
 """Characters of a library's error that a message quotes."""
+
+_OVERHEAD_BYTES = 256 * 1024
+"""Room for the files of a checkpoint besides its arrays: some 20, of which each takes a block."""
 
 _MIX = 0x9E3779B1
 """2³² over the golden ratio, odd: multiples of it spread over all 32 bits (Knuth, TAOCP 3, §6.4)."""
@@ -142,11 +146,12 @@ class Checkpoints:
           score: held-out score; only where `better` is set.
 
         Raises:
-          CheckpointError: this checkpoint, or the one before it, does not reach the disk.
+          CheckpointError: this checkpoint does not fit on the disk, or the one before it did not reach it.
           ValueError: a score that is not finite, or one without `better`.
         """
         if score is not None and not (self._scored and math.isfinite(score)):
             raise ValueError(f"score is {score}: must be finite, and `better` must be set; score held-out data")
+        self._require_room(state)
         state = jax.tree.map(jnp.copy, state)
         held = {"data": data, "digests": _digests(state)}
         args = ocp.args.Composite(
@@ -251,6 +256,16 @@ class Checkpoints:
         multihost_utils.sync_global_devices(f"set aside {step}")
         self._manager.reload()
         return aside
+
+    def _require_room(self, state: Any) -> None:
+        """Refuse a save before it begins: the threads of one that fails halfway print tracebacks of their own."""
+        needed = sum(x.nbytes for x in jax.tree.leaves(state)) + _OVERHEAD_BYTES
+        free = shutil.disk_usage(self._directory).free
+        if free < needed:
+            raise CheckpointError(
+                f"{self._directory}: {free / 1e6:,.1f} MB are free, and a checkpoint needs {needed / 1e6:,.1f}; the "
+                "one before it is whole: free some space, then resume"
+            )
 
     def _unsaved(self, error: Exception) -> CheckpointError:
         return CheckpointError(

@@ -2,6 +2,7 @@
 
 import logging
 import resource
+import shutil
 import sys
 from pathlib import Path
 
@@ -174,6 +175,13 @@ class TestDamage:
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         found, told = self.restored(stage)
         assert (found.step, told) == (2, [])
+
+    def test_a_checkpoint_that_will_not_fit_is_refused_before_it_is_written(self, stage, monkeypatch):
+        usage = shutil.disk_usage(stage)
+        monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=100_000))
+        with pytest.raises(CheckpointError, match=r"0\.1 MB are free, and a checkpoint needs 0\.3.*free some space"):
+            self.save(stage, 3)
+        assert sorted(p.name for p in stage.iterdir()) == ["1", "2"]
 
 
 class TestBest:
