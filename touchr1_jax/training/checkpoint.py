@@ -263,8 +263,8 @@ class Checkpoints:
         free = shutil.disk_usage(self._directory).free
         if free < needed:
             raise CheckpointError(
-                f"{self._directory}: {free / 1e6:,.1f} MB are free, and a checkpoint needs {needed / 1e6:,.1f}; the "
-                "one before it is whole: free some space, then resume"
+                f"{self._directory}: {free / 1e6:,.1f} MB are free, and a checkpoint needs {needed / 1e6:,.1f}; "
+                "what was saved before is whole: free some space, then resume"
             )
 
     def _unsaved(self, error: Exception) -> CheckpointError:
