@@ -22,7 +22,6 @@ from typing import Any, Literal
 
 import matplotlib as mpl
 import numpy as np
-from adjustText import adjust_text
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
@@ -385,8 +384,7 @@ def _entries(panels: Sequence[Panel]) -> dict[str, Line2D | Patch]:
 
 
 def _write_labels(axes: Axes, panel: Panel) -> None:
-    texts, points = [], []
-    line = {"arrowstyle": "-", "color": SHARED, "lw": 0.5}
+    texts, points, line = [], [], {"arrowstyle": "-", "color": SHARED, "lw": 0.5}
     for series in panel.series:
         for i, (x, y) in enumerate(zip(series.x, series.y, strict=True)):
             if not np.isfinite((x, y)).all():
@@ -396,5 +394,8 @@ def _write_labels(axes: Axes, panel: Panel) -> None:
                 colour = series.colour if isinstance(series.colour, str) else SHARED
                 texts.append(axes.text(x, y, series.labels[i], fontsize=7.5, color=colour, bbox=BEHIND))
     if texts:
-        x, y = zip(*points, strict=True)
-        adjust_text(texts, x, y, ax=axes, arrowprops=line, expand=(1.15, 1.5), iter_lim=ITERATIONS)
+        from adjustText import adjust_text  # it imports pyplot and scipy.spatial: a second at every start
+
+        adjust_text(
+            texts, *zip(*points, strict=True), ax=axes, arrowprops=line, expand=(1.15, 1.5), iter_lim=ITERATIONS
+        )

@@ -38,7 +38,7 @@ from touchr1_jax.training.train_encoder import EncoderTrainingConfig
 
 BENCH = StudyConfig(
     encoders=EncoderTrainingConfig(),
-    decoder=dataclasses.replace(DECODER, steps=1800, save_every=300),
+    decoder=dataclasses.replace(DECODER, steps=1200, save_every=300),
     blind=StudySFT(steps=1350, micro_contacts=16),
     grpo_steps=200,
 )

@@ -156,20 +156,17 @@ class StudySeed:
         """SFT of the decoder alone on encoded contacts, up to its best checkpoint; `seed` is that of the questions."""
         policy, stage, seed = self.policy, f"{stage}/{self.seed}", self.seed if seed is None else seed
 
-        def held_out(found: Params) -> float:
-            return share_right(evaluate_policy(policy, found, *validation, alone=False))
-
         def train() -> Params:
             order = self._order(config.batch_size) | {"seed": seed}
             clips = encoded_clips(contacts.features, np.arange(len(contacts.truth)), contacts.truth, **order)
-            feed = AnswerFeed(policy, clips, contacts.evidence, questions=config.questions, **order)
+            order |= {"questions": config.questions, "conclusion_weight": config.conclusion_weight}
+            feed = AnswerFeed(policy, clips, contacts.evidence, **order)
             with stage_hooks(self.context, stage, config.steps, scored=True) as hooks:
-                options: dict[str, Any] = {"seed": seed, "decoder_only": True, "held_out": held_out}
+                options: dict[str, Any] = {"seed": seed, "decoder_only": True, "held_out": self._judge(validation)}
                 return train_sft(policy, params, feed, config, hooks, **options)
 
         inputs = {**dataclasses.asdict(contacts.features), "truth": contacts.truth, "evidence": contacts.evidence}
-        held = {**dataclasses.asdict(validation[0]), "label": validation[1]}
-        arrays = {**params, "input": inputs, "validation": held}
+        arrays = {**params, "input": inputs, "validation": _named(validation)}
         return self._shared("grpo", stage, train, {"config": config, "seed": seed}, arrays)
 
     def run_grpo(
@@ -179,10 +176,12 @@ class StudySeed:
         contacts: EncodedContacts,
         params: Params,
         rollouts: RolloutServer | None = None,
+        validation: Validation | None = None,
     ) -> Params:
         """GRPO of an SFT policy's decoder with an arm's reward; alarms are logged and printed.
 
-        `rollouts` is a server that draws the rollouts; by default the step does.
+        With `validation` it is the policy of the best checkpoint, without it that of the last step.  `rollouts` is a
+        server that draws the rollouts; by default the step does.
         """
         policy, config, loop, stage = self.policy, arm.config, arm.loop, f"{stage}/{self.seed}"
 
@@ -191,20 +190,27 @@ class StudySeed:
             order |= {"evidence": None if left_out(config.algorithm.anchor) else contacts.evidence}
             feed = QuestionFeed(policy, contacts.features, contacts.label, **order)
             describe = functools.partial(describe_sample, policy)
-            with stage_hooks(self.context, stage, loop.steps, make_log=alarm_log, describe=describe) as hooks:
+            options: dict[str, Any] = {"make_log": alarm_log, "describe": describe, "scored": validation is not None}
+            with stage_hooks(self.context, stage, loop.steps, **options) as hooks:
                 more: dict[str, Any] = {"noise": contacts.noise, "seed": self.seed, "rollouts": rollouts}
+                more["held_out"] = None if validation is None else self._judge(validation)
                 return train_grpo(policy, params, feed, arm.score, config, loop, hooks, **more)
 
-        values = {"weights": list(arm.weights.items()), "config": config, "steps": loop.steps}
+        values = {"weights": list(arm.weights.items()), "config": config, "loop": loop}
         values |= {"full_share": contacts.full_share}
         inputs = {**dataclasses.asdict(contacts.features), "noise": contacts.noise, "prior": arm.prior}
         inputs |= {"label": contacts.label, "truth": contacts.truth, "evidence": contacts.evidence}
-        return self._shared("grpo", stage, train, values, {**params, "input": inputs})
+        held = {} if validation is None else _named(validation)
+        return self._shared("grpo", stage, train, values, {**params, "input": inputs, "validation": held})
 
     def continued(self, config: SFTConfig, contacts: EncodedContacts, validation: Validation, params: Params) -> Params:
         """The control, which continues SFT of the decoder on other questions."""
         order = self.seed + CONTINUED_ORDER
         return self.run_decoder(config, f"decoder/{CONTINUED}", contacts, validation, params, order)
+
+    def _judge(self, validation: Validation) -> Callable[[Params], float]:
+        """The share of right answers about validation contacts, of parameters."""
+        return lambda params: share_right(evaluate_policy(self.policy, params, *validation, alone=False))
 
     def _order(self, batch_size: int) -> dict[str, Any]:
         """Batches of this seed, of which the process reads its own rows."""
@@ -224,6 +230,11 @@ class StudySeed:
         fns, shape = self.policy.fns, self.context.devices.shape
         common = {"model": self.policy.model, "lora": fns.lora, "seed": self.seed, "mesh": shape}
         return cached(kind, {**common, **values}, arrays, train, self.context, stage)
+
+
+def _named(validation: Validation) -> dict[str, Any]:
+    """The arrays of validation contacts, for the hash of what depends on them."""
+    return {**dataclasses.asdict(validation[0]), "label": validation[1]}
 
 
 def supervised(of: StudySeed, *, tactile: Params | None = None, name: str = "") -> Params:
@@ -298,7 +309,8 @@ class SeedTraining(StudySeed):
     def _continue(self, name: str, params: Params, contacts: EncodedContacts, validation: Validation) -> Params:
         """The control or an arm, from what `_start` made."""
         if name != CONTINUED:
-            return self.run_grpo(self.arms[name], f"grpo/{name}", contacts, params, self.rollouts)
+            judged = validation if self.config.recipe == "touch" else None
+            return self.run_grpo(self.arms[name], f"grpo/{name}", contacts, params, self.rollouts, judged)
         return self.continued(self.config.continued, contacts, validation, params)
 
     def _evaluate_arms(self) -> None:

@@ -111,6 +111,7 @@ def answer_feed(
         questions=config.questions,
         blind=blind,
         easy_steps=round(config.curriculum * config.steps),
+        conclusion_weight=config.conclusion_weight,
         packing=config.packing(devices),
         **order,
     )

@@ -40,6 +40,7 @@ from sensors_io.units import WorkUnit, finish
 from touchr1_jax.models.pretrained import load_encoder
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import ModelConfig, TouchPolicy, build_policy, check_model, with_lora
+from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.rewards import AnyReward, RewardError, make_rewards, uniform_prior
 from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
 from touchr1_jax.text.language import TOUCH_LANGUAGE
@@ -50,8 +51,11 @@ from touchr1_jax.training.train_encoder import EncoderTrainingConfig
 from touchr1_jax.training.train_grpo import check_rewards
 from touchr1_jax.types import Params
 
-MODEL = ModelConfig(tactile=TactileViTConfig(sensors=0, num_layers=1, stem="statistics", stem_width=64))
-"""The default policy; its stem has no parameters before its first layer, so that it is computed once."""
+MODEL = ModelConfig(
+    tactile=TactileViTConfig(sensors=0, num_layers=1, stem="statistics", stem_width=64),
+    vision=VisionConfig(stem="statistics", num_layers=0),
+)
+"""The default policy; its tactile stem has no parameters before its first layer, so that it is computed once."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

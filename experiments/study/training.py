@@ -46,6 +46,7 @@ likelihood of the verified answers.  All stages learn from all training contacts
 DECODER = SFTConfig(
     steps=600,
     questions=len(ATTRIBUTES),
+    conclusion_weight=5.0,
     optimizer=OptimizerConfig(learning_rate=1e-5, lr_scale=100.0, warmup_steps=10),
 )
 """The decoder's phase: 64 questions a step."""
@@ -93,7 +94,8 @@ class TrainingConfig(SourceConfig):
     more_rewards: dict[str, float] = dataclasses.field(default_factory=dict)
     """Rewards that every arm earns besides its own, as in `overlong 0.1 diversity 0.05`."""
     grpo_steps: int = 150
-    grpo_save_every: int = 150
+    grpo_save_every: int = 50
+    """Steps between checkpoints, of which recipe `touch` takes the best on validation objects."""
     lora: LoraConfig = LoraConfig(rank=0)
     """Adapters that SFT and GRPO train in the place of the adapted towers' weights; rank 0 trains the weights."""
     samples: int = 8

@@ -96,7 +96,7 @@ class TouchPolicy:
 
     @functools.cached_property
     def level_tokens(self) -> LevelTokens:
-        """Token of each level, for an enumerated conclusion.
+        """Token of each level, for an conclusion that is enumerated or weighted.
 
         Raises:
           ValueError: a vocabulary that splits a level or a tag.
@@ -104,8 +104,8 @@ class TouchPolicy:
         found = level_tokens(self.language, self.tokenizer)
         if found is None:
             raise ValueError(
-                "enumerated is set, but this vocabulary writes a level or a tag in several tokens: each must be one "
-                "token to be enumerated; leave enumerated None"
+                "this vocabulary writes a level or a tag in several tokens: each must be one token for a conclusion "
+                "that is enumerated or weighted; leave enumerated None and conclusion_weight 1"
             )
         return found
 

@@ -165,6 +165,10 @@ class LevelTokens:
     opens: int
     level: np.ndarray
 
+    def concluded(self, tokens: np.ndarray) -> np.ndarray:
+        """True at the tokens of answers, int [*n, T], that are levels after the opening of `conclude`."""
+        return np.logical_or.accumulate(tokens == self.opens, -1) & np.isin(tokens, self.level)
+
 
 def level_tokens(language: Language | TurnLanguage, tokenizer: Tokenizer) -> LevelTokens | None:
     """The tokens of the levels; `None` where the tokenizer splits a level or the tag."""

@@ -144,8 +144,12 @@ class AnswerFeed(Feed):
       seed: of the questions.
       blind: show no touch.
       easy_steps: batches within which the share of questions that show all sensors falls to `FULL_SHARE`.
+      conclusion_weight: of a concluded level in the loss, where that of every other token is 1.
       packing: put tokens into rows; `None` pads.
       own: rows of a batch that this process reads; all by default.
+
+    Raises:
+      ValueError: a weight of the conclusion where a level is several tokens.
     """
 
     def __init__(
@@ -159,6 +163,7 @@ class AnswerFeed(Feed):
         seed: int,
         blind: bool = False,
         easy_steps: int = 0,
+        conclusion_weight: float = 1.0,
         packing: Packing | None = None,
         own: np.ndarray | None = None,
     ) -> None:
@@ -166,6 +171,8 @@ class AnswerFeed(Feed):
         self._batch_size, self._own = batch_size, np.arange(batch_size) if own is None else own
         self._policy, self._evidence, self._blind = policy, evidence, blind
         self._questions, self._packing, self._easy_steps = questions, packing, easy_steps
+        self._conclusion_weight = conclusion_weight
+        self._levels = None if conclusion_weight == 1 else policy.level_tokens
 
     def make(self, element: Mapping[str, Any], rng: np.random.Generator) -> SFTBatch:
         """Write the answers of one batch of clips; random numbers are drawn for the whole batch, not for `own`."""
@@ -192,6 +199,8 @@ class AnswerFeed(Feed):
             "tokens": tokens,
             "token_mask": masks,
         }
+        if self._levels is not None:
+            written["weight"] = np.where(self._levels.concluded(tokens), np.float32(self._conclusion_weight), 1)
         touch: TouchBatch | Features = element[ENCODED] if ENCODED in element else host_touch(element)
         return SFTBatch(touch=touch, rows=self._rows(touch, written), **written)
 

@@ -206,6 +206,31 @@ def fit(
     return state
 
 
+def fit_best(
+    step: Step,
+    state: Any,
+    batches: Batches,
+    config: LoopConfig,
+    hooks: Hooks = SILENT,
+    *,
+    held_out: Callable[[Any], float] | None,
+) -> Any:
+    """`fit`, and of the checkpoints the one with the highest held-out score; the last state without `held_out`.
+
+    Args:
+      step, state, batches, config, hooks, held_out: as in `fit`.
+
+    Raises:
+      ValueError: `held_out` without checkpoints.
+      NonFiniteGradientError: as `fit`.
+    """
+    if held_out is not None and hooks.checkpoints is None:
+        raise ValueError("hooks.checkpoints is None: must keep the best where held_out is given; set it")
+    state = fit(step, state, batches, config, hooks, held_out=held_out)
+    best = None if held_out is None or hooks.checkpoints is None else hooks.checkpoints.best(state)
+    return state if best is None else best.state
+
+
 def peek(batches: Batches) -> Any:
     """The next batch, which is made again when it is asked for."""
     place = batches.get_state()

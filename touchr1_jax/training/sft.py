@@ -43,6 +43,8 @@ class SFTBatch:
     token_mask: Bool[Array, "P Q T"]
     rows: PackedRows | None = None
     """Where the tokens stand in rows; `None` pads every question and answer."""
+    weight: Float[Array, "P Q T"] | None = None
+    """Weight of each answer token in the loss; `None` weighs all alike."""
 
 
 @struct.dataclass
@@ -112,15 +114,15 @@ def sft_gradient(
             f"rows were packed for {batch.rows.micro_batches} micro-batches: must be as many as the gradient's, "
             f"{contacts // micro}; pack with that number"
         )
-    most = jnp.maximum(jnp.sum(batch.token_mask), 1)
+    sizes = _sizes(batch)
 
     def share(params: Params, chunk: SFTBatch) -> tuple[Array, Array]:
         cost, right = sft_sums(fns, params, chunk, blind=blind, max_logits=max_logits)
-        return cost / most, right / most
+        return cost / sizes[0], right / sizes[1]
 
     def body(total: Any, chunk: SFTBatch) -> tuple[Any, None]:
         if (rows := chunk.rows) is not None:
-            return _add_rows(fns, params, chunk, rows, total, most, blind=blind, max_logits=max_logits), None
+            return _add_rows(fns, params, chunk, rows, total, sizes, blind=blind, max_logits=max_logits), None
         return jax.tree.map(jnp.add, total, jax.value_and_grad(share, has_aux=True)(params, chunk)), None
 
     zero = jnp.zeros(())
@@ -131,19 +133,28 @@ def sft_gradient(
 def sft_loss(
     fns: PolicyFns, params: Params, batch: SFTBatch, *, blind: bool = False, max_logits: int = MAX_LOGITS
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Cross-entropy of the answer's tokens, −mean log π(o_t | q, touch, o_<t), and the share predicted right.
+    """Cross-entropy of the answer's tokens, −Σ w_t log π(o_t | q, touch, o_<t) / Σ w_t, and the share predicted right.
 
     Questions and answers are padded here, even those of a packed batch.
     """
-    most = jnp.maximum(jnp.sum(batch.token_mask), 1)
+    weights, tokens = _sizes(batch)
     cost, right = sft_sums(fns, params, batch, blind=blind, max_logits=max_logits)
-    return cost / most, right / most
+    return cost / weights, right / tokens
+
+
+def _sizes(batch: SFTBatch) -> tuple[Array, Array]:
+    """Sum of the weights of the tokens that count, and their number; 1 where none counts."""
+    number = jnp.maximum(jnp.sum(batch.token_mask), 1)
+    if batch.weight is None:
+        return number, number
+    weights = masked.total(batch.weight, batch.token_mask)
+    return jnp.where(weights > 0, weights, 1.0), number
 
 
 def sft_sums(
     fns: PolicyFns, params: Params, batch: SFTBatch, *, blind: bool = False, max_logits: int = MAX_LOGITS
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """−Σ log π(o_t | q, touch, o_<t) over the answer's tokens, and how many of them are predicted right."""
+    """−Σ w_t log π(o_t | q, touch, o_<t) over the answer's tokens, and how many of them are predicted right."""
     features = encoded(fns, params, batch, blind=blind)
 
     def answer(features, ids, mask, streams, tokens):
@@ -158,6 +169,7 @@ def sft_sums(
     most = max(1, max_logits // contacts)
     found = jax.vmap(lambda r: _scored(fns, params, r, most))(rows)
     log_prob, right = (found[name].reshape(batch.tokens.shape) for name in ("log_prob", "right"))
+    log_prob = log_prob if batch.weight is None else batch.weight * log_prob
     return -masked.total(log_prob, batch.token_mask), masked.total(right, batch.token_mask).astype(jnp.float32)
 
 
@@ -216,7 +228,7 @@ def _add_rows(
     chunk: SFTBatch,
     rows: PackedRows,
     total: Any,
-    most: Array,
+    sizes: tuple[Array, Array],
     *,
     blind: bool,
     max_logits: int,
@@ -234,11 +246,15 @@ def _add_rows(
     made = padded_tokens(fns.module, fns.slots, features, *prompt, rows.contacts)
     source, predicts, tokens = jax.tree.map(by_group, (rows.source, rows.predicts, made))
     of_group = functools.partial(row_scores, fns, max_logits=max(1, max_logits // groups))
+    prompts = jnp.ones(chunk.ids.shape)
+    weight = None if chunk.weight is None else by_group(jnp.concatenate([prompts, chunk.weight], -1))
 
     def share(params: Params, seen: Array, i: Array) -> tuple[Array, Array]:
         found = jax.vmap(of_group, in_axes=(None, 0, 0, 0, 0))(params, seen, tokens, source[:, i], predicts[:, i])
+        if weight is not None:
+            found["log_prob"] *= _following(weight, source[:, i], predicts[:, i])
         log_prob, right = (masked.total(found[name], predicts[:, i] >= 0) for name in ("log_prob", "right"))
-        return -log_prob / most, right.astype(jnp.float32) / most
+        return -log_prob / sizes[0], right.astype(jnp.float32) / sizes[1]
 
     def body(i: Array, carry: Any) -> Any:
         sums, to_encoder = carry
@@ -248,3 +264,12 @@ def _add_rows(
     used = jnp.max(jnp.sum(jnp.any(source >= 0, -1), -1))
     (values, grads), to_seen = jax.lax.fori_loop(0, used, body, (total, jnp.zeros_like(by_group(encoded))))
     return values, jax.tree.map(jnp.add, grads, back(to_seen.reshape(encoded.shape))[0])
+
+
+def _following(
+    values: Float[Array, "group E n"], source: Int[Array, "group W"], predicts: Int[Array, "group K"]
+) -> Float[Array, "group K"]:
+    """Of the tokens of each group's examples, the value of the one that follows each predicting place of a row."""
+    after = jnp.clip(predicts + 1, 0, source.shape[-1] - 1)
+    token = jnp.maximum(jnp.take_along_axis(source, after, -1), 0)
+    return jnp.take_along_axis(values.reshape(len(values), -1), token, -1)

@@ -26,7 +26,7 @@ from touchr1_jax.rl.stream_check import check_streams, stream_influence
 from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.text.language import Language
 from touchr1_jax.text.template import LevelTokens
-from touchr1_jax.training.loop import SILENT, Batches, Hooks, LoopConfig, fit, peek
+from touchr1_jax.training.loop import SILENT, Batches, Hooks, LoopConfig, fit_best, peek
 from touchr1_jax.training.optimizer import falling_adamw
 from touchr1_jax.training.rollout_server import RolloutServer
 from touchr1_jax.training.train_sft import joined
@@ -45,6 +45,7 @@ def train_grpo(
     noise: Float[Array, "K S N D"],
     seed: int = 0,
     rollouts: RolloutServer | None = None,
+    held_out: Callable[[Params], float] | None = None,
 ) -> Params:
     """Reinforce the decoder of a policy by GRPO; both encoders stay as they are, and the reference is where it starts.
 
@@ -61,9 +62,11 @@ def train_grpo(
       noise: encoded noise streams of the policy's encoder (`encoding.noise_bank`).
       seed: of rollouts, and of adapters where there are none yet.
       rollouts: server that draws them, of a policy on released weights; by default the step does.
+      held_out: as in `train_sft`.
 
     Raises:
-      ValueError: a first batch without touch, a stream whose touch does not reach the policy; as `RolloutServer.check`.
+      ValueError: `held_out` without checkpoints, a first batch without touch, a stream whose touch does not reach the
+        policy; as `RolloutServer.check`.
       RolloutError: as `RolloutServer.rollouts`.
     """
     constraint = policy.constraint if config.algorithm.constrained else None
@@ -83,7 +86,12 @@ def train_grpo(
     if rollouts is not None:
         assert isinstance(policy, ReleasedPolicy)
         step = rollouts.before(step, policy, start["decoder"]["embedding"]["embedding"], config, hooks.devices)
-    return joined(whole, hooks.devices.gather(fit(step, state, batches, loop, hooks).params))
+
+    def complete(state: GRPOState) -> Params:
+        return joined(whole, hooks.devices.gather(state.params))
+
+    judge = None if held_out is None else lambda state: held_out(complete(state))
+    return complete(fit_best(step, state, batches, loop, hooks, held_out=judge))
 
 
 def check_rewards(rewards: Mapping[str, AnyReward], weights: Mapping[str, float], language: Language) -> None:

@@ -21,7 +21,7 @@ from touchr1_jax.models.lora import of_decoder, with_adapters
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.stacked import ADAPTERS, layer_by_layer
 from touchr1_jax.models.touch_policy import TouchPolicy
-from touchr1_jax.training.loop import SILENT, Batches, Hooks, LoopConfig, fit
+from touchr1_jax.training.loop import SILENT, Batches, Hooks, LoopConfig, fit_best
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
 from touchr1_jax.training.packing import Packing
 from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
@@ -49,10 +49,12 @@ class SFTConfig:
     """Keep only matrix products of the decoder for the backward pass and compute the rest again: less memory."""
     curriculum: float = 0.0
     """Share of the steps within which the share of questions that show all sensors falls from 1 to a half."""
+    conclusion_weight: float = 1.0
+    """Weight of the concluded level in the loss, where that of every other token of the answer is 1."""
     optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=100.0)
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "steps", "pack")
+        at_least(self, 0, "steps", "pack", "conclusion_weight")
         at_least(self, 1, "batch_size", "questions", "save_every", "micro_contacts", "max_logits")
         within(self, 0, 1, "curriculum")
         if self.batch_size % self.micro_contacts:
@@ -107,8 +109,6 @@ def train_sft(
       SizeError: a policy with frozen towers, and no adapters.
       ValueError: `held_out` without checkpoints.
     """
-    if held_out is not None and hooks.checkpoints is None:
-        raise ValueError("hooks.checkpoints is None: must keep the best where held_out is given; set it")
     lora = policy.fns.lora
     if policy.frozen and not lora.rank:
         raise SizeError(f"lora.rank is 0: must be at least 1 where {' and '.join(policy.frozen)} stand still; raise it")
@@ -128,9 +128,7 @@ def train_sft(
         return joined(whole, devices.gather(state.params))
 
     score = None if held_out is None else lambda state: held_out(complete(state))
-    state = fit(step, state, batches, loop, hooks, held_out=score)
-    best = hooks.checkpoints.best(state) if held_out is not None and hooks.checkpoints is not None else None
-    return complete(state if best is None else best.state)
+    return complete(fit_best(step, state, batches, loop, hooks, held_out=score))
 
 
 def joined(whole: Params, trained: Params) -> Params:

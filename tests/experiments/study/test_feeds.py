@@ -98,6 +98,17 @@ def readings(policy, batch):
             yield i, attribute_of(policy, batch.ids[i, j]), np.asarray(batch.streams[i, j]), said
 
 
+def test_the_concluded_level_weighs_what_it_is_told(policy, answers, clips):
+    """One token of each answer: the level after `<conclude>`; the same words before it weigh 1."""
+    plain, weighted = (answers(**more).make(clips, np.random.default_rng(0)) for more in ({}, {"conclusion_weight": 5}))
+    assert plain.weight is None
+    np.testing.assert_array_equal(plain.tokens, weighted.tokens)
+    for tokens, weight in zip(*(x.reshape(-1, x.shape[-1]) for x in (weighted.tokens, weighted.weight)), strict=True):
+        heavy = np.flatnonzero(weight != 1)
+        words = [policy.tokenizer.decode([token]).strip() for token in tokens]
+        assert (len(heavy), weight[heavy[0]], words[heavy[0] - 1]) == (1, 5, "<conclude>")
+
+
 def test_answers_say_what_the_evidence_and_the_labels_say(policy, answers, clips, evidence):
     seen = 0
     for draw in range(8):

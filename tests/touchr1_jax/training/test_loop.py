@@ -8,7 +8,16 @@ import pytest
 
 from tests.touchr1_jax.training.stepping import feed, guarded_start, guarded_step, start, step
 from touchr1_jax.training.checkpoint import Checkpoints
-from touchr1_jax.training.loop import HELD_OUT, SKIPPED, Hooks, LoopConfig, LoopTime, NonFiniteGradientError, fit
+from touchr1_jax.training.loop import (
+    HELD_OUT,
+    SKIPPED,
+    Hooks,
+    LoopConfig,
+    LoopTime,
+    NonFiniteGradientError,
+    fit,
+    fit_best,
+)
 from touchr1_jax.types import SAMPLE
 
 STEPS = 10
@@ -197,15 +206,21 @@ def test_a_request_to_stop_saves_where_it_is(whole, tmp_path):
         np.testing.assert_array_equal(a, b)
 
 
-def test_the_best_held_out_state_is_kept(tmp_path):
+def test_the_best_held_out_state_is_returned(tmp_path):
     """Scores are taken where a checkpoint is due: after steps 3, 6, 9 and 10."""
     scores, lines = iter([1.0, 4.0, 2.0, 3.0]), {}
     with Checkpoints(tmp_path, keep=1, better="higher") as checkpoints:
         held_out = lambda state: next(scores)
-        fit(step, start(), feed(), CONFIG, Hooks(checkpoints=checkpoints, log=lines.__setitem__), held_out=held_out)
-        assert int(checkpoints.best(start()).state.step) == 6
+        hooks = Hooks(checkpoints=checkpoints, log=lines.__setitem__)
+        assert int(fit_best(step, start(), feed(), CONFIG, hooks, held_out=held_out).step) == 6
         assert int(checkpoints.restore(start()).state.step) == STEPS
     assert {t: line[HELD_OUT] for t, line in lines.items() if HELD_OUT in line} == {2: 1.0, 5: 4.0, 8: 2.0, 9: 3.0}
+
+
+def test_the_best_state_needs_checkpoints():
+    with pytest.raises(ValueError, match=r"hooks.checkpoints is None: must keep the best"):
+        fit_best(step, start(), feed(), CONFIG, held_out=lambda state: 0.0)
+    assert int(fit_best(step, start(), feed(), CONFIG, held_out=None).step) == STEPS
 
 
 class Slow(Failing):

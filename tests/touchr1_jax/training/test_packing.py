@@ -128,10 +128,12 @@ def test_a_blind_policy_is_packed_too(params, batch):
 
 @pytest.mark.long
 def test_answers_of_which_a_part_counts_teach_that_part(params, batch):
-    """Nothing of one example, the first tokens of another, not the third of a third, which later ones see."""
+    """Nothing of one example, the first tokens of another, not the third of a third, which later ones see; all tokens
+    weigh differently."""
     counted = batch.token_mask.copy()
     counted[1, 1] = counted[0, 0, 5:] = counted[2, 0, 2] = False
-    some = batch.replace(token_mask=counted)
+    weight = np.random.default_rng(0).uniform(0.5, 2, counted.shape).astype(np.float32)
+    some = batch.replace(token_mask=counted, weight=weight)
     rows = packed(some, Packing(width=WIDTH, contacts=4))
     assert_same(gradient(None)(params, rows), gradient(None)(params, some))
     examples = np.unique(np.asarray(rows.rows.source)[np.asarray(rows.rows.source) >= 0] // N)

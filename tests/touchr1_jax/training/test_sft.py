@@ -72,22 +72,26 @@ def test_encoded_contacts_train_the_decoder_as_the_contacts_do_and_nothing_else(
 
 
 @pytest.mark.long
-def test_loss_is_the_cross_entropy_of_the_answers_by_hand(params, batch):
+@pytest.mark.parametrize("weighted", [False, True])
+def test_loss_is_the_cross_entropy_of_the_answers_by_hand(params, batch, weighted):
     """In float64 from the logits of one prompt and answer at a time."""
+    weight = np.random.default_rng(0).uniform(0.5, 2, batch.tokens.shape) if weighted else np.ones(batch.tokens.shape)
+    batch = batch.replace(weight=jnp.asarray(weight, jnp.float32)) if weighted else batch
     features = jax.jit(lambda p, b: FNS.encode(p, b))(params, batch.touch)
-    cost, right, count = 0.0, 0, 0
+    cost, right, count, total = 0.0, 0, 0, 0.0
     for q in range(Q):
         seen = features.replace(stream_mask=features.stream_mask & batch.streams[:, q])
         logits = group_logits(params, seen, batch.ids[:, q], batch.mask[:, q], batch.tokens[:, q, None])[:, 0]
         for p, t in np.argwhere(batch.token_mask[:, q]):
             row = np.asarray(logits[p, t], np.float64)
             token = int(batch.tokens[p, q, t])
-            cost += np.log(np.exp(row - row.max()).sum()) - (row[token] - row.max())
+            cost += weight[p, q, t] * (np.log(np.exp(row - row.max()).sum()) - (row[token] - row.max()))
+            total += weight[p, q, t]
             right += int(row.argmax() == token)
             count += 1
     value, accuracy = loss(params, batch)
     assert count == P * Q * 11
-    np.testing.assert_allclose(value, cost / count, rtol=1e-5)
+    np.testing.assert_allclose(value, cost / total, rtol=1e-5)
     np.testing.assert_allclose(accuracy, right / count, rtol=1e-6)
 
 
