@@ -33,7 +33,7 @@ from experiments.core.look import LOOK, MARKERS, PALETTE, SHARED, colours, svg
 from experiments.core.text import WithInterval, number
 
 LONG_AXIS = 300.0  # ends of a logarithmic axis, one over the other, beyond which its ticks are powers of ten alone
-ITERATIONS = 200  # of the placement of labels; a limit in seconds would make a picture depend on the machine
+PLACING: dict[str, Any] = {"expand": (1.15, 1.5), "iter_lim": 200}  # seconds would make a picture depend on the machine
 LETTERS = 13  # an inch, of a tick or a legend
 STROKES, STROKE = ("|", "_", "x", "+"), 1.5  # markers without an area, width of their lines in points
 BEHIND = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}  # text, legible on lines that it crosses
@@ -384,7 +384,7 @@ def _entries(panels: Sequence[Panel]) -> dict[str, Line2D | Patch]:
 
 
 def _write_labels(axes: Axes, panel: Panel) -> None:
-    texts, points, line = [], [], {"arrowstyle": "-", "color": SHARED, "lw": 0.5}
+    texts, points = [], []
     for series in panel.series:
         for i, (x, y) in enumerate(zip(series.x, series.y, strict=True)):
             if not np.isfinite((x, y)).all():
@@ -396,6 +396,5 @@ def _write_labels(axes: Axes, panel: Panel) -> None:
     if texts:
         from adjustText import adjust_text  # it imports pyplot and scipy.spatial: a second at every start
 
-        adjust_text(
-            texts, *zip(*points, strict=True), ax=axes, arrowprops=line, expand=(1.15, 1.5), iter_lim=ITERATIONS
-        )
+        line = {"arrowstyle": "-", "color": SHARED, "lw": 0.5}
+        adjust_text(texts, *zip(*points, strict=True), ax=axes, arrowprops=line, **PLACING)
