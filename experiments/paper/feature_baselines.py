@@ -160,12 +160,15 @@ def linear_probe(
     return np.stack(columns, 1)
 
 
-def encoder_probe(trained: TrainedPolicy, *, swapped: bool = False) -> Evaluation:
-    """Levels by a linear probe on the encoded touch; `swapped` gives every contact the touch of another object."""
+def encoder_probe(trained: TrainedPolicy, *, swapped: bool = False, picture: bool = False) -> Evaluation:
+    """Levels by a linear probe on the encoded touch; `swapped` gives every contact the touch of another object.
+
+    With `picture` the probe reads the encoded picture too, beside all streams together and beside each alone.
+    """
     data = trained.data
     rows = data.training
-    known = mean_tokens(encode_rows(trained.policy, trained.params, data, rows, trained.context))
-    asked = mean_tokens(trained.test)
+    encoded = encode_rows(trained.policy, trained.params, data, rows, trained.context), trained.test
+    known, asked = (mean_tokens(features, picture=picture) for features in encoded)
     if swapped:
         known = known.rows(other_objects(data.object_ids[rows], trained.seed))
         asked = asked.rows(other_objects(data.object_ids[data.parts["test"]], trained.seed))
@@ -173,11 +176,14 @@ def encoder_probe(trained: TrainedPolicy, *, swapped: bool = False) -> Evaluatio
     return level_answers(trained.policy, trained.evaluation, *together_and_alone(probe, known, data.label[rows], asked))
 
 
-def mean_tokens(features: Features) -> ContactFeatures:
-    """Mean over the tokens of each stream."""
+def mean_tokens(features: Features, *, picture: bool = False) -> ContactFeatures:
+    """Mean over the tokens of each stream; with `picture` the mean over its tokens follows in every stream."""
     there = (np.asarray(features.touch_time) >= 0) & np.asarray(features.stream_mask)[..., None]
     total = (np.asarray(features.touch) * there[..., None]).sum(-2)
     x = total / np.maximum(there.sum(-1), 1)[..., None]
+    if picture:
+        view = np.asarray(features.view).mean(-2) * np.asarray(features.view_mask)[:, None]
+        x = np.concatenate([x, np.broadcast_to(view[:, None], (*x.shape[:2], view.shape[-1]))], -1)
     return ContactFeatures(x=x.astype(np.float32), present=there.any(-1))
 
 

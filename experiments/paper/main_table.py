@@ -6,9 +6,9 @@ The bench's questions (see `dataset_card`) about the test objects of a study cov
 properties at once, comparisons and orders, single sensors, and objects with misleading pictures.  The full model
 (published rewards and grounding), SFT alone and SFT continued for as many seconds as GRPO takes answer them.  Baselines
 are constants, the measured force, the picture alone (a probe, and a policy trained without touch), the nearest training
-contacts by their fields, a linear probe on the encoder of SFT, and the same probe with another object's touch.
-Policies and baselines answer about one touch at a time; comparisons are computed from these answers (see
-`experiments.paper.bench_scores`).
+contacts by their fields, and linear probes on the encoder of SFT: of its touch, of touch and picture, and of another
+object's touch.  Policies and baselines answer about one touch at a time; comparisons are computed from these answers
+(see `experiments.paper.bench_scores`).
 
 Cost: about 45 minutes on two cores with five seeds; the other studies of the bench reuse its policies. `--scale
 smoke` under two.
@@ -41,7 +41,7 @@ from touchr1_jax.bench.averages import AVERAGED
 from touchr1_jax.bench.questions.draw import Quota
 from touchr1_jax.training.evaluation import Evaluation
 
-ENCODER_PROBE, SWAPPED = "encoder_probe", "shuffled_touch"
+ENCODER_PROBE, PICTURE_PROBE, SWAPPED = "encoder_probe", "encoder_and_picture_probe", "shuffled_touch"
 PICTURE, NEAREST = "vision_only", "nearest_fields"
 
 TOUCHLESS = ("constant", "constant_joint", "constant_middle", "force_only", PICTURE, BLIND, SWAPPED)
@@ -69,6 +69,7 @@ def run(config: MainConfig, context: Context) -> Results:
     """Train, answer, score."""
     variants = {
         ENCODER_PROBE: EvalVariant(of=SFT, evaluate=features.encoder_probe),
+        PICTURE_PROBE: EvalVariant(of=SFT, evaluate=functools.partial(features.encoder_probe, picture=True)),
         SWAPPED: EvalVariant(of=SFT, evaluate=functools.partial(features.encoder_probe, swapped=True)),
     }
     study = run_full_model(config.study, context, variants)
@@ -83,7 +84,8 @@ def run(config: MainConfig, context: Context) -> Results:
     trained = {name: rows[name] for name in study.policies}
     pictures, reliability = level_report(study)
     controlled = against_control(trained, (FULL,))
-    comparisons = [*against(trained, FULL, SFT), *controlled, *against(rows, SFT, ENCODER_PROBE)]
+    comparisons = [*against(trained, FULL, SFT), *controlled]
+    comparisons += [c for probe in (ENCODER_PROBE, PICTURE_PROBE) for c in against(rows, SFT, probe)]
     note = "policies that another study trained before cost nothing here"
     return Results(
         arms=trained,

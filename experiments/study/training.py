@@ -40,7 +40,8 @@ Recipe = Literal["touch", "paper"]
 published.
 `touch`: the encoders learn levels by a linear head, then SFT teaches the decoder alone to read what they encode, then
 GRPO on the same contacts, about all attributes, half of the questions with a part of the sensors, anchored by the
-likelihood of the verified answers.  All stages learn from all training contacts.
+likelihood of the verified answers.  All stages learn from all training contacts; SFT of the decoder, GRPO and the
+control end with their best checkpoint on validation objects.
 """
 
 DECODER = SFTConfig(

@@ -11,6 +11,7 @@ from experiments.paper.feature_baselines import (
     ContactFeatures,
     field_features,
     linear_probe,
+    mean_tokens,
     nearest,
     other_objects,
     picture_features,
@@ -73,6 +74,22 @@ def test_a_probe_reads_a_stream_and_gives_bottom_where_it_is_absent():
     assert np.array_equal(together[1:], truth[1:])
     assert np.array_equal(alone[:, 0], together)
     assert together[0, 0] == -1
+
+
+def test_tokens_of_the_picture_stand_beside_each_stream_by_hand():
+    """Two sensors, the second absent; a token without time does not count, nor does a picture that is not there."""
+    seen = SimpleNamespace(
+        touch=np.array([[[[1.0], [3.0]], [[5.0], [7.0]]]] * 2),
+        touch_time=np.array([[[0, 0], [0, 0]], [[0, -1], [0, 0]]]),
+        stream_mask=np.array([[True, False]] * 2),
+        view=np.array([[[2.0, 4.0], [4.0, 8.0]]] * 2),
+        view_mask=np.array([True, False]),
+    )
+    plain, both = mean_tokens(seen), mean_tokens(seen, picture=True)
+    np.testing.assert_array_equal(plain.x[:, :, 0], [[2, 0], [1, 0]])
+    np.testing.assert_array_equal(both.x[..., :1], plain.x)
+    np.testing.assert_array_equal(both.x[..., 1:], [[[3, 6]] * 2, [[0, 0]] * 2])
+    np.testing.assert_array_equal(both.present, [[True, False]] * 2)
 
 
 def test_other_objects_are_others_and_all_are_drawn():
