@@ -163,7 +163,7 @@ CURVES: Mapping[str, tuple[str, ...]] = {**SFT_CURVES, "grpo": GRPO_CURVES}
 """Of each phase the scalars that are drawn."""
 
 DIFFERENCES: tuple[tuple[str, str, str], ...] = (
-    ("policy", "Qwen2.5-VL, 7 billion pretrained parameters", "0.6 million parameters, from scratch"),
+    ("policy", "Qwen2.5-VL, 7 billion pretrained parameters", "0.4 million parameters, from scratch"),
     ("base", "the pretrained model, asked without training", "the commonest level of each attribute"),
     ("data", "14,700 recorded sequences by four sensors", "2,400 generated objects, a press by four sensors"),
     ("questions", "4,800, authored and audited", "all four attributes of every unseen object"),

@@ -95,7 +95,7 @@ def summary(found: tuple[ClaimOutcome, ...]) -> str:
 
 
 SCOPE = (
-    "Ours are policies of 0.6 million parameters, trained from scratch on generated scenes of four sensors, scored on "
+    "Ours are policies of at most 0.6 million parameters, trained from scratch on generated scenes of four sensors, scored on "
     "objects that do not occur in training: directions can be compared, sizes cannot. Intervals are of 95 %, over "
     "seeds where arms are compared, else over objects."
 )
