@@ -13,8 +13,8 @@ object's touch.  Policies and baselines answer about one touch at a time; compar
 Cost: about 25 minutes on two cores with five seeds; the other studies of the bench reuse its policies. `--scale
 smoke` under two.
 
-Expected: touch adds over thirty points to every baseline without it.  SFT is better than a linear probe on its touch and
-about one point worse than a probe that also reads the picture.  GRPO is no better than SFT that is continued for as
+Expected: touch adds over thirty points to every baseline without it.  SFT is better than a linear probe on its touch
+and about one point worse than a probe that also reads the picture.  GRPO is no better than SFT that is continued for as
 long.  Baselines without touch are near chance in comparisons.  A constant has an average of about 28.
 """
 
