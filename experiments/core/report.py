@@ -36,6 +36,8 @@ ROWS = {
 
 SETTINGS = {
     "lr_scale": ("learning rate", "{} × the paper's"),
+    "beta": ("weight of the KL β", "{}"),
+    "micro_prompts": ("gradients at a time", "of {} prompts"),
     "sft_lr_scale": ("learning rate of SFT", "{} × the paper's"),
 }
 """Setting → its name and its value in words."""
