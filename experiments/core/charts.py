@@ -23,18 +23,14 @@ from typing import Any, Literal
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import LogLocator, NullFormatter, NullLocator, StrMethodFormatter
 
-from experiments.core.look import LOOK, MARKERS, PALETTE, SHARED, colours, svg
+from experiments.core.look import LETTERS, LOOK, MARKERS, PALETTE, SHARED, colours, set_ticks, svg
 from experiments.core.text import WithInterval, number
 
-LONG_AXIS = 300.0  # ends of a logarithmic axis, one over the other, beyond which its ticks are powers of ten alone
 PLACING: dict[str, Any] = {"expand": (1.15, 1.5), "iter_lim": 200}  # seconds would make a picture depend on the machine
-LETTERS = 13  # an inch, of a tick or a legend
 STROKES, STROKE = ("|", "_", "x", "+"), 1.5  # markers without an area, width of their lines in points
 BEHIND = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}  # text, legible on lines that it crosses
 ROOM = 0.12  # for the figure at the end of the longest bar, over the length of the axis
@@ -96,7 +92,7 @@ class Series:
     high: Values = ()
     band: bool = False
     bar: bool = False
-    line: str = "-"
+    line: Any = "-"
     marker: str | None = None
     colour: Any = None
     size: float | Values = 28.0
@@ -290,11 +286,12 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
         _draw_rule(axes, rule)
     if panel.x_limits != (None, None):  # else it would end the autoscaling of an axis that panels share
         axes.set_xlim(*panel.x_limits)
-    _set_ticks(axes.xaxis, panel.x_scale, panel.x_ticks)
+    whole = not panel.rows and all(np.equal(np.mod(s.x, 1), 0).all() for s in panel.series)
+    set_ticks(axes.xaxis, panel.x_scale, panel.x_ticks, whole=whole)
     if not panel.rows:
         if panel.y_limits != (None, None):
             axes.set_ylim(*panel.y_limits)
-        _set_ticks(axes.yaxis, panel.y_scale, panel.y_ticks, panel.y_format)
+        set_ticks(axes.yaxis, panel.y_scale, panel.y_ticks, panel.y_format)
 
 
 def _draw_bars(axes: Axes, panel: Panel) -> None:
@@ -317,7 +314,7 @@ def _draw_bars(axes: Axes, panel: Panel) -> None:
 def _draw_points(axes: Axes, panel: Panel, series: Series) -> None:
     _draw_intervals(axes, panel, series)
     if series.line and not panel.rows:
-        axes.plot(series.x, series.y, series.line, color=series.colour, lw=series.width, alpha=series.alpha)
+        axes.plot(series.x, series.y, ls=series.line, color=series.colour, lw=series.width, alpha=series.alpha)
     if series.marker:
         look = {"color": series.colour, "linewidths": STROKE if series.marker in STROKES else 0}
         if series.hollow:
@@ -347,23 +344,6 @@ def _draw_rule(axes: Axes, rule: Rule) -> None:
         axes.axvline(rule.x, **look)
     elif rule.y is not None:
         axes.axhline(rule.y, **look)
-
-
-def _set_ticks(axis: Axis, scale: Scale, ticks: Mapping[float, str] | None, form: str = "") -> None:
-    """The ticks given, else matplotlib's; on a short logarithmic axis 2 and 5 times powers of ten too, if they fit."""
-    if ticks is not None:
-        axis.set_ticks(list(ticks), list(ticks.values()))
-        axis.set_minor_locator(NullLocator())
-        return
-    if scale == "log":
-        low, high = axis.get_view_interval()
-        fine = LogLocator(subs=(1.0, 2.0, 5.0))
-        letters = sum(len(f"{tick:g}") for tick in fine.tick_values(low, high) if low <= tick <= high)
-        room = LETTERS * axis.axes.bbox.width / axis.axes.figure.dpi if axis is axis.axes.xaxis else math.inf
-        axis.set_major_locator(fine if high < LONG_AXIS * low and letters <= room else LogLocator(subs=(1.0,)))
-        axis.set_minor_formatter(NullFormatter())
-    if form or scale != "linear":
-        axis.set_major_formatter(StrMethodFormatter(form or "{x:g}"))
 
 
 def _entries(panels: Sequence[Panel]) -> dict[str, Line2D | Patch]:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments.core.charts import Panel, Series, draw
-from experiments.core.look import MARKERS, PALETTE, SHARED, colours
+from experiments.core.look import MARKERS, SHARED, Mark, marks
 from experiments.core.results import Estimate
 from touchr1_jax.bench.metrics import METRICS
 
@@ -27,12 +27,14 @@ WORDS = {
     "held_out": "score on validation objects",
     "kl": "KL to the reference (nat a token)",
     "length": "length (tokens)",
-    "loss": "loss (nat a token)",
     "middle_rate": "share of middle levels",
     "mode_share": "share of the commonest level",
     "parse_rate": "share of readable answers",
 }
 """Scalar → its name in a chart, where the words in that of the log say too little."""
+
+OF_TEXT = {"sft", "decoder", "blind"}
+"""Phases whose loss is that of the tokens of answers; losses of other phases have units of their own."""
 
 Curve = tuple[np.ndarray, np.ndarray]  # steps and values of one logged scalar of one stage
 
@@ -68,7 +70,7 @@ class PhaseCurves(NamedTuple):
 def draw_phases(
     rows: Sequence[Mapping[str, Any]],
     wanted: Mapping[str, Sequence[str]],
-    colour: Mapping[str, str] | None = None,
+    mark: Mapping[str, Mark] | None = None,
     *,
     most: int | None = None,
 ) -> dict[str, PhaseCurves]:
@@ -76,7 +78,7 @@ def draw_phases(
 
     Args:
       wanted: phase → scalars to draw; of a phase that is not named all, or the first `most`.
-      colour: that of each arm; by default in the order of their first line.
+      mark: that of each arm; by default in the order of their first line.
     """
     drawn = {}
     for phase, scalars in curves_by_phase(rows).items():
@@ -84,20 +86,23 @@ def draw_phases(
         if names:
             shown = {name: scalars[name] for name in names}
             arms = dict.fromkeys(arm for series in shown.values() for arm, _ in series if arm)
-            svg = training_curves(shown, colours(arms) if colour is None else colour)
+            svg = training_curves(shown, marks(arms) if mark is None else mark, phase)
             drawn[phase] = PhaseCurves(svg, names, len(scalars) - len(names))
     return drawn
 
 
-def training_curves(scalars: Mapping[str, Mapping[tuple[str, str], Curve]], colour: Mapping[str, str]) -> bytes:
+def training_curves(
+    scalars: Mapping[str, Mapping[tuple[str, str], Curve]], mark: Mapping[str, Mark], phase: str = ""
+) -> bytes:
     """Draw one panel per scalar: a thin line per seed, a bold one for the running mean over the seeds of an arm."""
     columns = min(3, len(scalars))
     lines = sum(len(series) + len({arm for arm, _ in series}) for series in scalars.values())
     most = min(MOST_POINTS, max(FEWEST_POINTS, POINTS_OF_CHART // lines))
+    words = {**WORDS, "loss": "loss (nat a token)"} if phase in OF_TEXT else WORDS
     panels = [
         Panel(
-            _seeds_and_means(series, colour, most),
-            title=WORDS.get(name, name.replace("_", " ")),
+            _seeds_and_means(series, mark, most),
+            title=words.get(name, name.replace("_", " ")),
             x_label="step" if i >= len(scalars) - columns else "",
         )
         for i, (name, series) in enumerate(scalars.items())
@@ -105,12 +110,13 @@ def training_curves(scalars: Mapping[str, Mapping[tuple[str, str], Curve]], colo
     return draw(panels, size=(3.35 * columns, 0.35 + 2.15 * math.ceil(len(scalars) / columns)))
 
 
-def _seeds_and_means(series: Mapping[tuple[str, str], Curve], colour: Mapping[str, str], most: int) -> list[Series]:
+def _seeds_and_means(series: Mapping[tuple[str, str], Curve], mark: Mapping[str, Mark], most: int) -> list[Series]:
     """All thin lines first, so that no seed covers a mean; a line has at most `most` points."""
     seeds, means = [], []
     for arm in dict.fromkeys(arm for arm, _ in series):
         curves = [curve for (a, _), curve in series.items() if a == arm]
-        look: dict[str, Any] = {"colour": colour.get(arm, SHARED), "marker": ""}
+        own = mark.get(arm, Mark(SHARED))
+        look: dict[str, Any] = {"colour": own.colour, "line": own.line, "marker": ""}
         seeds += [Series(x=thin(x, most), y=thin(y, most), width=0.6, alpha=0.25, **look) for x, y in curves]
         common = np.array(sorted(set.intersection(*(set(steps.tolist()) for steps, _ in curves))))
         if len(common):
@@ -130,12 +136,13 @@ def thin(values: np.ndarray, most: int) -> np.ndarray:
 def accuracy_against_middle(
     arms: Mapping[str, Mapping[str, Estimate]],
     baselines: Mapping[str, Mapping[str, Estimate]],
-    colour: Mapping[str, str],
+    mark: Mapping[str, Mark],
 ) -> bytes | None:
     """Draw accuracy over the rate of middle answers: a small dot per seed, a large mean; `None` if not measured."""
     series, size = [], (6.6, 3.2 + 0.09 * len({**arms, **baselines}))  # with room for the legend
-    for i, (name, row) in enumerate(arms.items()):  # from the eleventh arm on, colours return with other markers
-        series += _point(name, row, colour.get(name, SHARED), MARKERS[i // len(PALETTE) % len(MARKERS)])
+    for name, row in arms.items():
+        own = mark.get(name, Mark(SHARED))
+        series += _point(name, row, own.colour, own.marker)
     for (name, row), marker in zip(baselines.items(), itertools.cycle(MARKERS[1:]), strict=False):
         series += _point(name, row, SHARED, marker)
     x_label, y_label = f"{METRICS['middle_rate'].meaning} (%)", f"{METRICS['acc'].title} (%)"

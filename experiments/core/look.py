@@ -2,10 +2,13 @@
 
 import io
 import itertools
-from collections.abc import Iterable
-from typing import Any
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
 
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator, StrMethodFormatter
 
 PALETTE = (
     *("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"),
@@ -20,6 +23,12 @@ CONTROLS = {"sft": "#1d2126", "sft_continued": "#8c564b", "tactile_blind": SHARE
 """Colours of the policies that every study trains beside its arms; in curves they have stages of their own."""
 
 MARKERS = "osD^vXph"
+SYMBOLS = "●■◆▲▼✖⬟⬢"  # the markers in a text
+
+LINES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (6, 2, 1, 2, 1, 2)))
+
+LONG_AXIS = 300.0  # ends of a logarithmic axis, one over the other, beyond which its ticks are powers of ten alone
+LETTERS = 13  # an inch, of a tick or a legend
 
 LOOK: dict[Any, Any] = {
     "svg.hashsalt": "touchr1-jax",  # the same data give the same file
@@ -39,6 +48,47 @@ def colours(names: Iterable[str]) -> dict[str, str]:
     """The colour of every name: that of a control, or the next of the palette, so that charts and tables agree."""
     free = itertools.cycle(PALETTE)
     return {name: CONTROLS.get(name) or next(free) for name in names}
+
+
+class Mark(NamedTuple):
+    """Look of a name in charts and tables: colour, matplotlib's marker and line, and the marker as a letter."""
+
+    colour: str
+    marker: str = MARKERS[0]
+    line: Any = LINES[0]
+    symbol: str = SYMBOLS[0]
+
+
+def marks(names: Iterable[str]) -> dict[str, Mark]:
+    """The mark of every name; when the colours are used up they return with other markers and lines."""
+    names = tuple(names)
+    turn = {name: i // len(PALETTE) for i, name in enumerate(name for name in names if name not in CONTROLS)}
+    look = lambda i: (MARKERS[i % len(MARKERS)], LINES[i % len(LINES)], SYMBOLS[i % len(SYMBOLS)])
+    return {name: Mark(colour, *look(turn.get(name, 0))) for name, colour in colours(names).items()}
+
+
+def set_ticks(
+    axis: Axis, scale: str, ticks: Mapping[float, str] | None, form: str = "", *, whole: bool = False
+) -> None:
+    """The ticks given, else matplotlib's, of which `whole` keeps whole numbers; formatted by `form`.
+
+    On a short logarithmic axis 2 and 5 times powers of ten have ticks too, if they fit.
+    """
+    if ticks is not None:
+        axis.set_ticks(list(ticks), list(ticks.values()))
+        axis.set_minor_locator(NullLocator())
+        return
+    if scale == "log":
+        low, high = axis.get_view_interval()
+        fine = LogLocator(subs=(1.0, 2.0, 5.0))
+        letters = sum(len(f"{tick:g}") for tick in fine.tick_values(low, high) if low <= tick <= high)
+        room = LETTERS * axis.axes.bbox.width / axis.axes.figure.dpi if axis is axis.axes.xaxis else math.inf
+        axis.set_major_locator(fine if high < LONG_AXIS * low and letters <= room else LogLocator(subs=(1.0,)))
+        axis.set_minor_formatter(NullFormatter())
+    elif scale == "linear" and whole:
+        axis.set_major_locator(MaxNLocator("auto", steps=[1, 2, 5, 10], integer=True))
+    if form or scale != "linear":
+        axis.set_major_formatter(StrMethodFormatter(form or "{x:g}"))
 
 
 def svg(figure: Figure) -> bytes:

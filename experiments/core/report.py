@@ -15,12 +15,45 @@ import numpy as np
 from experiments.core import curves
 from experiments.core.artifacts import write_bytes, write_text
 from experiments.core.context import read_metrics
-from experiments.core.look import colours
+from experiments.core.look import marks
 from experiments.core.results import Cell, Column, Comparison, Results, Slot, Table
-from experiments.core.text import MEANINGLESS, SMOKE, bounds, number, plain
+from experiments.core.text import MEANINGLESS, SMOKE, bounds, number, plain, preset_in_words
 from touchr1_jax.bench.scoring import REPORTED
 
 _FIGURES = re.compile(r"[-+−–\d\s.,:;%×()\[\]]{0,40}")  # more of them take several lines, as words do
+
+
+ROWS = {
+    "sft": "supervised fine-tuning on verified answers (SFT); arms of GRPO start from it",
+    "sft_continued": "SFT that goes on for as long as GRPO takes",
+    "tactile_blind": "a policy that is trained without touch",
+    "constant": "the most frequent level of each attribute, whatever is touched",
+    "constant_joint": "the most frequent combination of levels",
+    "constant_middle": "the middle level of each attribute",
+    "force_only": "a linear classifier of the measured forces alone",
+    "vision_only": "a linear classifier of the picture alone",
+    "encoder_probe": "a linear classifier of the touch that SFT encodes",
+    "encoder_and_picture_probe": "a linear classifier of the touch and the picture that SFT encodes",
+    "shuffled_touch": "the classifier of the encoded touch, with the touch of another object",
+    "nearest_fields": "the levels of the training contacts with the nearest depth and displacement",
+}
+"""Row that many experiments share → what it is."""
+
+SETTINGS = {
+    "lr_scale": ("learning rate", "{} × the paper's"),
+    "beta": ("weight of the KL β", "{}"),
+    "micro_prompts": ("gradients at a time", "of {} prompts"),
+    "sft_lr_scale": ("learning rate of SFT", "{} × the paper's"),
+}
+"""Setting → its name and its value in words."""
+
+
+def settings_in_words(settings: Mapping[str, Any]) -> dict[str, str]:
+    """Settings as the head of a page shows them."""
+    words = {"preset": preset_in_words}
+    shown = {name: words.get(name, plain)(value) for name, value in settings.items()}
+    named = {name: SETTINGS.get(name, (name, "{}")) for name in shown}
+    return {named[name][0]: named[name][1].format(value) for name, value in shown.items()}
 
 
 def write_report(directory: Path, results: Results, *, about: str, description: Mapping[str, Any]) -> Path:
@@ -29,13 +62,13 @@ def write_report(directory: Path, results: Results, *, about: str, description: 
     `about` is the docstring of the experiment, `description` the content of the run's `config.json`.
     """
     rows = read_metrics(directory)
-    colour, settings = colours(_charted(results.arms, rows)), dict(results.settings)
+    mark, settings = marks(_charted(results.arms, rows)), settings_in_words(results.settings)
     smoke = description["scale"] == SMOKE
     middle, drawn = None, {}
     if results.arms:
-        settings["seeds"] = len(next(iter(next(iter(results.arms.values())).values())).per_seed)
-        middle = curves.accuracy_against_middle(results.arms, results.baselines, colour)
-        drawn = curves.draw_phases(rows, results.curves, colour)
+        settings["seeds"] = str(len(next(iter(next(iter(results.arms.values())).values())).per_seed))
+        middle = curves.accuracy_against_middle(results.arms, results.baselines, mark)
+        drawn = curves.draw_phases(rows, results.curves, mark)
     plots = {f"{picture.name}.{picture.kind}": picture.content for picture in results.pictures}
     plots |= {f"curves_{phase}.svg": phase_curves.svg for phase, phase_curves in drawn.items()}
     plots |= {} if middle is None else {"accuracy_against_middle.svg": middle}
@@ -53,8 +86,9 @@ def write_report(directory: Path, results: Results, *, about: str, description: 
         data={name: value for name, value in results.data.items() if not isinstance(value, Mapping)},
         data_title="Data and time",
         results=results,
-        colour=colour,
+        mark=mark,
         reported=REPORTED,
+        row_meanings={name: ROWS[name] for name in (*results.arms, *results.baselines) if name in ROWS},
         metrics={name: metric for name, metric in REPORTED.items() if name in measured},
         best={(metric, arm) for arm in results.arms for metric in REPORTED if is_best(metric, arm, results)},
         pairs=_pairs(results.comparisons),
@@ -68,7 +102,7 @@ def write_report(directory: Path, results: Results, *, about: str, description: 
 
 
 def _charted(arms: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Arms with a curve or a rate of middle answers, in the tables' order; for all others ten colours are too few."""
+    """Arms with a curve or a rate of middle answers, in the tables' order; others need no mark."""
     curved = dict.fromkeys("/".join(line["stage"].split("/")[1:-1]) for line in rows)
     shown = [arm for arm, row in arms.items() if arm in curved or {"acc", "middle_rate"} <= row.keys()]
     return shown + [arm for arm in curved if arm and arm not in shown]
@@ -159,6 +193,14 @@ def _data_uri(content: bytes, kind: str) -> str:
     return f"data:image/{media};base64,{base64.b64encode(content).decode()}"
 
 
+def width_px(content: bytes, kind: str) -> float:
+    """Width of a picture as a browser shows it; the charts state theirs in points."""
+    if kind == "svg":
+        found = re.search(rb'<svg[^>]* width="([\d.]+)(pt)?"', content)
+        return float(found[1]) * (96 / 72 if found[2] else 1) if found else 0.0
+    return float(int.from_bytes(content[16:20]))  # in the first chunk of a PNG
+
+
 def _consecutive(every: Iterable[Any], attribute: str) -> list[tuple[str, list[Any]]]:
     """Neighbours of one value of an attribute; jinja's own `groupby` sorts."""
     return [(key, list(of)) for key, of in itertools.groupby(every, lambda one: getattr(one, attribute))]
@@ -183,5 +225,6 @@ ENVIRONMENT.filters |= {
     "plain": plain,
     "png": png,
     "strip": strip,
+    "width_px": width_px,
     "word_columns": word_columns,
 }

@@ -1,5 +1,6 @@
 """Numbers, intervals and times as a reader sees them in reports, tables and logs."""
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
@@ -61,6 +62,27 @@ def plain(value: object) -> str:
     if isinstance(value, list | tuple):
         return ", ".join(plain(item) for item in value) or "none"
     return str(value)
+
+
+PRESET = {
+    "prompts": "{} prompts a step",
+    "group": "{} answers to each",
+    "micro_prompts": "gradients of {} prompts at a time",
+    "length": "at most {} tokens",
+    "gamma": "grounding γ = {}",
+    "beta": "KL β = {}",
+}
+"""Change of a preset in words, where its name says too little."""
+
+
+def preset_in_words(preset: str) -> str:
+    """A preset's name and changes: `paper with prompts=4` becomes `paper with 4 prompts a step`."""
+    name, _, changes = preset.partition(" with ")
+    pairs = [one.partition("=") for one in re.split(r", (?=\w+=)", changes) if one]
+    switch = {"True": "{}", "False": "no {}", "None": "no {}"}
+    words = lambda key, value: switch.get(value, f"{{}} {value}").format(key.replace("_", " "))
+    changed = ", ".join(PRESET[key].format(value) if key in PRESET else words(key, value) for key, _, value in pairs)
+    return f"{name} with {changed}" if changed else preset
 
 
 def duration(seconds: float) -> str:

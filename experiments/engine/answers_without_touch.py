@@ -1,6 +1,7 @@
 """Answers that earn reward without touch, under the rewards of every preset: a table, a chart and a requirement."""
 
 import functools
+import re
 from collections.abc import Mapping, Sequence
 from typing import get_args
 
@@ -26,13 +27,18 @@ PRIORS: Mapping[str, Sequence[float]] = {
 ACCURACIES = tuple(np.linspace(1 / 3, 1, 13).tolist())
 
 
+def spelt(name: str) -> str:
+    """A class of presets as the command line spells it, such as `dr-grpo`."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", "-", name).lower()
+
+
 @functools.cache
 def preset_earnings() -> dict[str, dict[str, Earnings]]:
     """Presets that share their rewards, by name → labels → what every program earns."""
     presets = [kind() for kind in get_args(AnyAlgorithm)]
     groups = [[preset for preset in presets if preset.stable_rewards == stable] for stable in (False, True)]
     return {
-        ", ".join(type(preset).__name__ for preset in group): {
+        ", ".join(spelt(type(preset).__name__) for preset in group): {
             labels: earnings(make_rewards(with_prior(prior)), reward_weights(group[0], PUBLISHED), prior)
             for labels, prior in PRIORS.items()
         }
@@ -65,7 +71,7 @@ def adversary_table() -> Table:
 
 def adversary_requirement() -> Requirement:
     """No program beats the honest one under the rewards of `stable`, whatever the labels."""
-    better = sum(len(found.better()) for found in preset_earnings()["Stable"].values())
+    better = sum(len(found.better()) for found in preset_earnings()["stable"].values())
     return at_most("answers that outwit the rewards of stable", better, 0, note=f"of {len(programs())} × {len(PRIORS)}")
 
 
@@ -81,7 +87,7 @@ def adversary_picture() -> Picture:
                 f"best other, labels {labels}", x=ACCURACIES, y=each[:, :-1].max(1), colour=PALETTE[i], line=":"
             )
             series.append(best)
-        title = "stable" if preset == "Stable" else "paper and all others"
+        title = "stable" if preset == "stable" else "paper and all others"
         panels.append(Panel(series, title=title, x_label="accuracy of touch", y_label="expected reward"))
     return Picture(
         name="answers_without_touch",

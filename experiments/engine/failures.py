@@ -19,7 +19,7 @@ PAPER = GrpoVariant(name="paper", algorithm=Paper())
 STABLE = GrpoVariant(name="stable", algorithm=Stable())
 WATCHED = GrpoVariant(name="paper, controls watched", algorithm=WATCHING)
 LITERAL = GrpoVariant(name="paper, literal bonus", algorithm=Paper(tactile_use=TactileUse.LITERAL), accuracy="exact")
-SCORE_FUNCTION = GrpoVariant(name="paper, k1", algorithm=Paper(kl="k1"))
+SCORE_FUNCTION = GrpoVariant(name="paper, KL by k1", algorithm=Paper(kl="k1"))
 
 PLAIN = World()
 NO_TOUCH = World(noise=4.0, sight=0.9)  # touch with next to no information, and a picture that is nearly always right

@@ -157,7 +157,7 @@ def run(config: ParetoGrpoConfig, context: Context) -> Results:
             "learning_rate": config.learning_rate,
             "rollouts a step": config.rollouts,
             "steps": config.steps,
-            "target": config.target,
+            "target of the mean reward": config.target,
         },
     )
 
@@ -217,9 +217,12 @@ def cost_table(target: float, curves: Curves) -> Table:
         formats={"a step": ".1f", "score": ".3f", "steps to the target": ".0f"},
         units={"a step": "ms", "to the target": "s"},
         meanings={
+            "group": "answers to each prompt",
+            "a step": "median",
             "score": "mean reward over the last tenth of the steps and the seeds",
             "steps to the target": "median over seeds, where every seed passed it",
             "to the target": "steps times seconds a step",
+            "seeds there": "seeds that passed the target",
         },
     )
 

@@ -191,7 +191,13 @@ def peer_table(size: JobSize, alone: Timings, first: Timings, peers: Peers) -> T
         rows,
         formats={"over this": ".1f", "over this one's": ".1f", "share of peak": ".2f"},
         units={"prefix": "tokens", "an iteration": "s", "peak memory": "GB", "first iteration": "s"},
-        meanings={"over this": "its time over that of this engine", "share of peak": "by the work of this engine"},
+        meanings={
+            "an iteration": "median",
+            "over this": "its time over that of this engine",
+            "over this one's": "its memory over that of this engine, which compiles too",
+            "share of peak": "by the work of this engine, of the speed of large matrix products",
+            "timed": "iterations",
+        },
         note="; ".join(f"{name}: {text}" for name, text in versions.items()),
     )
 

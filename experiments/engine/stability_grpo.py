@@ -247,7 +247,9 @@ def summary_table(outcomes: Sequence[ScenarioOutcome]) -> Table:
         ],
         formats={"breaks": "g", "half": "g", "stable": "g", "alarm": ".2f", "false": ".2f"},
         meanings={
-            "parameter": "in brackets the variant that is compared with the stable preset",
+            "parameter": "in brackets the variant that is compared with the stable preset; controls watched: answers "
+            "without touch are sampled and do not count; literal bonus: the tactile-use reward as the paper's abstract "
+            "words it; KL by k1: estimated by log π/π_ref",
             "breaks": "first value at which any seed of that variant fails",
             "half": "first value at which more than half of them do",
             "failed": "runs of the stable preset that fail at values where the variant does",

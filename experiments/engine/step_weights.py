@@ -111,17 +111,30 @@ def measured(config: StepWeightsConfig, stage: str, layers: int) -> dict[str, fl
     }
 
 
+MEANINGS = {
+    "tracing": "time of the processor until JAX has recorded the step",
+    "compiling": "time of the processor until the recorded step is a program",
+    "elapsed": "time on the clock of both, with waiting",
+    "arguments": "parameters, state of the optimizer and batch",
+    "temporary": "what the step needs beside them",
+    "reserved": "all that the compiler reserves",
+    "first": "time of the first step, on drawn weights",
+    "second": "time of the second step",
+    "weights": "memory of the frozen weights",
+    "peak": "largest resident size of the process that ran both steps",
+}
+
+
 def table(rows: list[dict[str, Any]]) -> Table:
     """Every step."""
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    whole = [{name: row.get(name, "") for name in names} for row in rows]
-    seconds, bytes_ = ("tracing", "compiling", "elapsed", "first", "second"), ("arguments", "temporary", "reserved")
-    units = dict.fromkeys(seconds, "s") | dict.fromkeys((*bytes_, "peak", "weights"), "GB")
+    named = [name for name in MEANINGS if any(name in row for row in rows)]
+    seconds = {"tracing", "compiling", "elapsed", "first", "second"}
     return named_table(
         "Steps of adapters on frozen weights",
-        whole,
-        units={name: unit for name, unit in units.items() if name in names},
-        note=f"Tracing and compiling in seconds of the processor, {jax.default_backend()}; elapsed includes waiting.",
+        rows,
+        units={name: "s" if name in seconds else "GB" for name in named},
+        meanings={name: MEANINGS[name] for name in named},
+        note=f"Compiled for {jax.default_backend()}.",
     )
 
 

@@ -163,11 +163,15 @@ CURVES: Mapping[str, tuple[str, ...]] = {**SFT_CURVES, "grpo": GRPO_CURVES}
 """Of each phase the scalars that are drawn."""
 
 DIFFERENCES: tuple[tuple[str, str, str], ...] = (
-    ("policy", "Qwen2.5-VL, 7 billion pretrained parameters", "0.4 million parameters, from scratch"),
+    ("policy", "Qwen2.5-VL, 7 billion pretrained parameters", "0.4 million parameters by default, from scratch"),
     ("base", "the pretrained model, asked without training", "the commonest level of each attribute"),
-    ("data", "14,700 recorded sequences by four sensors", "2,400 generated objects, a press by four sensors"),
+    (
+        "data",
+        "14,700 recorded sequences by four sensors",
+        "generated objects, 2,400 by default, a press by four sensors",
+    ),
     ("questions", "4,800, authored and audited", "all four attributes of every unseen object"),
-    ("learning rate", "1e-6 in GRPO, 1e-5 in SFT", "the same times 200 falling to 10, and times 100"),
+    ("learning rate", "1e-6 in GRPO, 1e-5 in SFT", "by default the same times 200 falling to 10, and times 100"),
     ("grounding γ, clip", "not given", ".01, .2"),
     ("tactile use", "in the abstract alone", "an arm of its own, above the paper's last row"),
     ("Avg of the ladder", "equals the mean of its four accuracies", "that mean"),

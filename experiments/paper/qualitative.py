@@ -192,7 +192,7 @@ def case_table(cases: Sequence[AnswerCase]) -> Table:
                 "case": case.title,
                 "answers": int(case.rows.sum()),
                 "of": int(case.among.sum()),
-                "share": case.share,
+                "share": case.share if case.among.any() else None,
                 "paper's examples": case.paper,
             }
             for case in cases
@@ -203,8 +203,8 @@ def case_table(cases: Sequence[AnswerCase]) -> Table:
             "of": "questions that could have been of this case",
             "paper's examples": "described in the caption of its figure",
         },
-        note="Greedy answers of the full model's first seed to all questions about the test objects. The paper shows "
-        "chosen examples without their frequency.",
+        note="The full model's most likely answers, of its first seed, to all questions about the test objects. The "
+        "paper shows chosen examples without their frequency.",
     )
 
 

@@ -49,7 +49,7 @@ DRAWN = ("acc", "omae")
 TRENDS = (*DRAWN, "mat_acc", "sfd", *sizes.CLAIMED)
 
 DIFFERENCES = (
-    ("sizes", "3, 7, 14 billion parameters", ".28, .64 and 1.3 million"),
+    ("sizes", "3, 7, 14 billion parameters", ".28, .64 and 1.3 million by default"),
     ("steps", "the same for all, not given", "the same for all"),
 )
 

@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from urllib.parse import quote
 
 import pytest
 
@@ -34,11 +35,21 @@ LOOK = """<script>window.addEventListener("load", () => {
     const edge = one.getBoundingClientRect().right;
     if (edge > width + 1) cut.push(`${one.tagName}.${one.className} ends at ${Math.round(edge)} of ${width} px`);
   }
+  const broad = [];
+  for (const one of document.querySelectorAll(".wide > img")) {
+    const shown = one.getBoundingClientRect().width, frame = one.parentElement, px = Math.round(shown);
+    if (shown > one.naturalWidth + 1) broad.push(`${one.alt} is enlarged to ${px} px`);
+    if (frame.scrollWidth <= frame.clientWidth + 1) continue;
+    const said = getComputedStyle(one).mixBlendMode === "multiply";  // else its white covers the frame's shadow
+    if (width > 480 || shown > 3 * width || !said) broad.push(`${one.alt} has ${px} of ${width} px`);
+  }
   const unnamed = [...document.querySelectorAll("tbody tr:not(.more)")].filter(row => !row.cells[0].textContent.trim());
   document.body.dataset.seen = JSON.stringify({
-    cut: cut.slice(0, 3), missing: [...document.images].filter(i => !i.naturalWidth).length, unnamed: unnamed.length});
+    cut: cut.slice(0, 3), broad: broad.slice(0, 3),
+    missing: [...document.images].filter(i => !i.naturalWidth).length, unnamed: unnamed.length});
 });</script>"""
-"""Lists what ends beyond the page and what has no name; only the copy that the test opens has it."""
+"""Lists what ends beyond the page, charts that are enlarged or that scroll where a reader does not expect it, and what
+has no name; only the copy that the test opens has it."""
 
 FRAME = """<body><iframe src="page.html" style="width:{width}px;height:2000px;border:0"></iframe><script>
 window.addEventListener("load", () => {{
@@ -65,7 +76,9 @@ def look(page: Path, width: int, folder: Path) -> dict[str, object]:
 def check(page: Path, folder: Path) -> None:
     assert page.stat().st_size < MOST_BYTES
     for width in WIDTHS_PX:
-        assert look(page, width, folder) == {"cut": [], "missing": 0, "unnamed": 0}, f"{page.name} at {width} px"
+        assert look(page, width, folder) == {"cut": [], "broad": [], "missing": 0, "unnamed": 0}, (
+            f"{page.name} at {width} px"
+        )
 
 
 def run(*arguments: str) -> None:
@@ -82,8 +95,18 @@ def test_a_column_that_is_cut_is_found(tmp_path):
     page = tmp_path / "report.html"
     rows = "<tr><td>sft</td></tr><tr><td> </td></tr>"
     page.write_text(f'<body><p style="width:900px">wide</p><img src="none.png"><table>{rows}</table></body>')
-    assert look(page, 1280, tmp_path) == {"cut": [], "missing": 1, "unnamed": 1}
+    assert look(page, 1280, tmp_path) == {"cut": [], "broad": [], "missing": 1, "unnamed": 1}
     assert look(page, 800, tmp_path)["cut"] == ["P. ends at 908 of 800 px"]
+
+
+def test_a_chart_that_is_enlarged_or_scrolls_unseen_is_found(tmp_path):
+    page = tmp_path / "report.html"
+    chart = quote('<svg xmlns="http://www.w3.org/2000/svg" width="500" height="9"/>')
+    frame = '<div class="wide" style="overflow-x:auto"><img alt="{}" style="{}" src="data:image/svg+xml,{}"></div>'
+    looks = {"said": "mix-blend-mode:multiply", "unsaid": "", "large": "width:510px;mix-blend-mode:multiply"}
+    page.write_text("".join(frame.format(name, style, chart) for name, style in looks.items()) + "</body>")
+    assert look(page, 800, tmp_path)["broad"] == ["large is enlarged to 510 px"]
+    assert look(page, 390, tmp_path)["broad"] == ["unsaid has 500 of 390 px", "large is enlarged to 510 px"]
 
 
 @pytest.mark.parametrize("name", recorded_names())

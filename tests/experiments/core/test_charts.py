@@ -8,7 +8,7 @@ import pytest
 
 from experiments.core.charts import BEATEN, Panel, Rule, Series, bars, dominated, draw, speed_against_error
 from experiments.core.curves import curves_by_phase, running_mean, training_curves
-from experiments.core.look import PALETTE, colours
+from experiments.core.look import MARKERS, PALETTE, colours, marks
 from experiments.core.pictures import Heatmap, heatmaps, image_grid
 
 NUMBER = r"-?[\d.]+"
@@ -60,6 +60,18 @@ def test_a_name_has_one_colour_and_one_entry_in_all_panels():
     assert sorted(shown) == ["bound", "first", "second"]
     assert len(lines(drawn, PALETTE[1])) == 3  # one in each panel, one in the legend
     assert colours("abc").items() <= colours("abcd").items()
+
+
+def test_fifty_names_look_different_in_tables_and_as_lines_and_a_control_keeps_its_colour():
+    found = marks([*map(str, range(25)), "sft", *map(str, range(25, 50))])
+    assert len({(one.colour, one.symbol) for one in found.values()}) == len(found)
+    assert len({(one.colour, one.line) for one in found.values()}) == len(found)
+    assert found["sft"].marker == MARKERS[0]
+
+
+def test_whole_numbers_have_whole_ticks():
+    assert "0.5" not in texts(draw([Panel([Series(x=[0, 1, 2, 3], y=[0, 10, 20, 30])])]))
+    assert "0.5" in texts(draw([Panel([Series(x=[0, 1.5, 3], y=[0, 10, 20])])]))
 
 
 def test_lines_pass_through_their_points_and_rows_stand_from_the_top():

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from experiments.core.artifacts import write_text
-from experiments.core.look import PALETTE
+from experiments.core.look import PALETTE, SYMBOLS
 from experiments.core.report import is_best, pieces, word_columns, write_report
 from experiments.core.results import Comparison, Estimate, Picture, Results, Trace, named_table
-from experiments.core.text import MEANINGLESS, SMOKE, bounds, number
+from experiments.core.text import MEANINGLESS, SMOKE, bounds, number, preset_in_words
 from tests.experiments.core.test_results import FAST, SLOW
 from tests.experiments.fakes import coin
 from touchr1_jax.bench.metrics import METRICS
@@ -109,8 +109,8 @@ def test_the_page_is_well_formed_whole_and_loads_nothing(tmp_path, results):
     assert not re.search(r"https?://|@import|url\(", page)
     assert not {"script", "link", "iframe"} & reader.seen
     for text in (
-        "Does it?", "Being paid helps.", "paid", "unpaid", "blind", "preset paper", "lr scale 100", "loss",
-        "<th>sft</th><td>2</td><td>2.0</td><td>4.0</td>",
+        "Does it?", "Being paid helps.", "paid", "unpaid", "blind", "preset paper", "loss",
+        "learning rate 100 × the paper's", "<th>sft</th><td>2</td><td>2.0</td><td>4.0</td>",
         "NOT MET", "≥ 400 records/s", "−2.00", "winkler", "–", "left is faster", "Fields of xense",
     ):  # fmt: skip
         assert text in reader.text or text in page
@@ -220,6 +220,28 @@ def test_pairs_of_a_metric_are_together_and_a_column_without_figures_is_left_out
 def test_the_sign_of_zero_shows_in_an_interval_alone():
     assert [number(x, spec) for x, spec in ((-0.04, "+.1f"), (-0.04, ".1f"), (-0.06, ".1f"))] == ["+0.0", "0.0", "−0.1"]
     assert bounds(-0.04, 0.04, "+.1f") == "[−0.0, +0.0]"
+
+
+def test_a_preset_is_told_in_words():
+    changed = "paper with prompts=4, buckets=(8, 12), enumerated=none, mask_truncated=True, segment_credit=False"
+    words = "paper with 4 prompts a step, buckets (8, 12), enumerated none, mask truncated, no segment credit"
+    assert [preset_in_words(preset) for preset in ("paper", changed)] == ["paper", words]
+
+
+def test_a_heading_keeps_its_hyphen_on_the_line_and_an_empty_answer_is_told(tmp_path, results):
+    empty = dataclasses.replace(coin.example(), trace="", slots=())
+    page = write(tmp_path, dataclasses.replace(results, examples=(empty,)))
+    assert '<th><span class="whole">H-Acc</span><span' in page
+    assert "an empty answer" in page
+
+
+def test_arms_beyond_the_colours_have_other_symbols(tmp_path, results):
+    arms = {f"arm_{i}": row(60.0) for i in range(len(PALETTE) + 1)}
+    page = write(tmp_path, dataclasses.replace(results, arms=arms, comparisons=(), baselines={"sft": row(1.0)}))
+    shown = re.findall(r'data-mark="(.)" style="color:(#\w+)"></span>(\w+)', page)
+    assert len({look[:2] for look in shown}) == len(arms)
+    assert SYMBOLS[1] in {symbol for symbol, *_ in shown}
+    assert "sft: supervised fine-tuning" in page
 
 
 def test_a_text_is_cut_at_its_segments():

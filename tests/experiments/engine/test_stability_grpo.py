@@ -26,7 +26,7 @@ def test_the_adversary_finds_answers_under_the_published_rewards_and_none_under_
     table, better = adversary_table(), dict[str, list[int]]()
     for presets, *_, count in table.rows:
         better.setdefault(presets, []).append(count)
-    assert better.pop("Stable") == [0] * len(PRIORS)
+    assert better.pop("stable") == [0] * len(PRIORS)
     (published,) = better.values()
     assert min(published) > 0
     assert adversary_requirement().measured == 0
