@@ -95,9 +95,9 @@ def summary(found: tuple[ClaimOutcome, ...]) -> str:
 
 
 SCOPE = (
-    "Ours are policies of at most 0.6 million parameters, trained from scratch on generated scenes of four sensors, scored on "
-    "objects that do not occur in training: directions can be compared, sizes cannot. Intervals are of 95 %, over "
-    "seeds where arms are compared, else over objects."
+    "Ours are policies of at most 0.6 million parameters, trained from scratch on generated scenes of four sensors, "
+    "scored on objects that do not occur in training: directions can be compared, sizes cannot. Intervals are of "
+    "95 %, over seeds where arms are compared, else over objects."
 )
 
 
