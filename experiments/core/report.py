@@ -31,6 +31,12 @@ ROWS = {
     "constant_joint": "the most frequent combination of levels",
     "constant_middle": "the middle level of each attribute",
     "force_only": "a linear classifier of the measured forces alone",
+    "full": "GRPO with the whole objective",
+    "untrained": "the policy before any training",
+    "encoder_probe": "a linear classifier of the touch, as the policy's trained encoders see it",
+    "shuffled_touch": "the same classifier, of another object's touch",
+    "vision_only": "a linear classifier of the picture alone",
+    "nearest_fields": "the levels of the training contacts whose recorded fields are most alike",
 }
 """Row that many experiments share → what it is."""
 
