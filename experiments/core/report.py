@@ -31,11 +31,13 @@ ROWS = {
     "constant_joint": "the most frequent combination of levels",
     "constant_middle": "the middle level of each attribute",
     "force_only": "a linear classifier of the measured forces alone",
+    "full": "GRPO with the whole objective",
+    "untrained": "the policy before any training",
+    "encoder_probe": "a linear classifier of the touch, as the policy's trained encoders see it",
+    "encoder_and_picture_probe": "the same classifier, of touch and picture",
+    "shuffled_touch": "the same classifier, of another object's touch",
     "vision_only": "a linear classifier of the picture alone",
-    "encoder_probe": "a linear classifier of the touch that SFT encodes",
-    "encoder_and_picture_probe": "a linear classifier of the touch and the picture that SFT encodes",
-    "shuffled_touch": "the classifier of the encoded touch, with the touch of another object",
-    "nearest_fields": "the levels of the training contacts with the nearest depth and displacement",
+    "nearest_fields": "the levels of the training contacts whose recorded fields are most alike",
 }
 """Row that many experiments share → what it is."""
 
