@@ -86,7 +86,7 @@ def test_another_setting_is_another_checkpoint(sft, first, steps, seed):
 def grpo(policy, params, data, tmp_path):
     """An arm of a run; one of no steps is trained at once."""
 
-    def run(name, weights=(("accuracy", 1.0),), moved=0.0, steps=0, seed=0):
+    def run(name, weights=(("accuracy", 1.0),), moved=0.0, steps=0, seed=0, validated=False):
         features = tiny.features(2)
         features = dataclasses.replace(features, touch=features.touch + moved)
         noise, label = jnp.asarray(tiny.features(1, seed=1).touch), np.zeros((2, 4), np.int32)
@@ -95,7 +95,8 @@ def grpo(policy, params, data, tmp_path):
         loop = LoopConfig(steps=steps, save_every=1)
         arm = make_arm(policy, dict(weights), data.prior(), tiny.STUDY.grpo, loop)
         of = {"config": tiny.STUDY, "data": data, "policy": policy, "evidence": evidence, "seed": seed, "share": True}
-        train = lambda context: StudySeed(**of, context=context).run_grpo(arm, "grpo/a", contacts, params)
+        more = {"validation": (features, label)} if validated else {}
+        train = lambda context: StudySeed(**of, context=context).run_grpo(arm, "grpo/a", contacts, params, **more)
         return within(tmp_path, name, train)
 
     return run
@@ -110,6 +111,7 @@ def grpo(policy, params, data, tmp_path):
         ({"moved": 1e-6}, 1),
         pytest.param({"steps": 1}, 1, marks=pytest.mark.slow),  # compiles the step, as the paper's runs do
         ({"seed": 1}, 1),
+        ({"validated": True}, 1),
     ],
     ids=str,
 )

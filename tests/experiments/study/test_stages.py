@@ -1,8 +1,10 @@
 """Evidence of the contacts of a study; SFT in rows and by adapters: the same policy, or a change of low rank."""
 
 import dataclasses
+import itertools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -19,6 +21,8 @@ from touchr1_jax.training.checkpoint import Checkpoints
 from touchr1_jax.training.feeds import AnswerFeed, encoded_clips
 from touchr1_jax.training.linear_probe import ProbeConfig
 from touchr1_jax.training.loop import Hooks, LoopConfig
+from touchr1_jax.training.questions import QuestionFeed
+from touchr1_jax.training.train_grpo import train_grpo
 from touchr1_jax.training.train_sft import train_sft
 
 PROBE = ProbeConfig(folds=2, iterations=4)
@@ -115,6 +119,29 @@ def test_the_decoders_phase_trains_the_decoder_alone_and_returns_its_best_point(
     start, second, third = (x["adapters"]["decoder"]["last_layer"]["q_proj"]["b"] for x in scored)
     assert np.any(start != second)
     assert np.any(second != third)
+
+
+@pytest.mark.long
+def test_grpo_returns_its_best_point(policy, data, params, tmp_path):
+    """The second of three points is the best; the encoders are those of the start."""
+    arm = make_arm(policy, PUBLISHED, data.prior(), tiny.STUDY.grpo, LoopConfig(steps=3, save_every=1))
+    rows, scores, scored = data.parts["sft"], iter([1.0, 3.0, 2.0]), []
+    label, drawn = data.label[rows], arm.config.drawn
+    feed = QuestionFeed(policy, tiny.features(len(rows)), label, batch_size=drawn, seed=0, truth=label)
+
+    def held_out(found):
+        scored.append(jax.tree.map(np.asarray, found))
+        return next(scores)
+
+    with Checkpoints(tmp_path, better="higher") as checkpoints:
+        more = {"noise": jnp.asarray(tiny.features(1, seed=1).touch), "held_out": held_out}
+        found = train_grpo(
+            policy, params, feed, arm.score, arm.config, arm.loop, Hooks(checkpoints=checkpoints), **more
+        )
+    jax.tree.map(np.testing.assert_array_equal, found, scored[1])
+    jax.tree.map(np.testing.assert_array_equal, found["tactile"], params["tactile"])
+    points = [jax.tree.leaves(x["decoder"]) for x in scored]
+    assert all(any(np.any(a != b) for a, b in zip(x, y, strict=True)) for x, y in itertools.pairwise(points))
 
 
 @pytest.mark.parametrize(("recipe", "anchor"), [("touch", 1.0), ("paper", 0.0)])
