@@ -374,7 +374,7 @@ def _write_labels(axes: Axes, panel: Panel) -> None:
                 colour = series.colour if isinstance(series.colour, str) else SHARED
                 texts.append(axes.text(x, y, series.labels[i], fontsize=7.5, color=colour, bbox=BEHIND))
     if texts:
-        from adjustText import adjust_text  # it imports pyplot and scipy.spatial: a second at every start
+        from adjustText import adjust_text  # it imports pyplot and scipy.spatial, which no start needs
 
         line = {"arrowstyle": "-", "color": SHARED, "lw": 0.5}
         adjust_text(texts, *zip(*points, strict=True), ax=axes, arrowprops=line, **PLACING)
