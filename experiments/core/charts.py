@@ -18,17 +18,17 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 from experiments.core.look import LETTERS, LOOK, MARKERS, PALETTE, SHARED, colours, set_ticks, svg
 from experiments.core.text import WithInterval, number
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
 
 PLACING: dict[str, Any] = {"expand": (1.15, 1.5), "iter_lim": 200}  # seconds would make a picture depend on the machine
 STROKES, STROKE = ("|", "_", "x", "+"), 1.5  # markers without an area, width of their lines in points
@@ -163,6 +163,9 @@ def draw(
 
     The `size` is in inches and by default grows with panels and rows; all panels may share an axis.
     """
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
     columns = min(columns, len(panels))
     lines = math.ceil(len(panels) / columns)
     panels = _resolved([_crossed(panel) if panel.better else panel for panel in panels])
@@ -269,7 +272,7 @@ def _size(panels: Sequence[Panel], columns: int, lines: int) -> tuple[float, flo
     return (3.3 * columns + (0.6 if rows else 0.2), 0.5 + lines * (0.6 + 0.34 * rows if rows else 2.5))
 
 
-def _draw_panel(axes: Axes, panel: Panel) -> None:
+def _draw_panel(axes: "Axes", panel: Panel) -> None:
     axes.set_title(panel.title, fontsize=9.5, loc="left")
     axes.set(xlabel=panel.x_label, ylabel=panel.y_label)
     for set_scale, scale in ((axes.set_xscale, panel.x_scale), (axes.set_yscale, panel.y_scale)):
@@ -294,7 +297,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
         set_ticks(axes.yaxis, panel.y_scale, panel.y_ticks, panel.y_format)
 
 
-def _draw_bars(axes: Axes, panel: Panel) -> None:
+def _draw_bars(axes: "Axes", panel: Panel) -> None:
     """Bars of one series lie on its rows; of several, side by side or end to end."""
     every = [series for series in panel.series if series.bar]
     height = 0.6 if panel.stacked else 0.7 / max(len(every), 1)
@@ -311,7 +314,7 @@ def _draw_bars(axes: Axes, panel: Panel) -> None:
             axes.margins(x=ROOM)
 
 
-def _draw_points(axes: Axes, panel: Panel, series: Series) -> None:
+def _draw_points(axes: "Axes", panel: Panel, series: Series) -> None:
     _draw_intervals(axes, panel, series)
     if series.line and not panel.rows:
         axes.plot(series.x, series.y, ls=series.line, color=series.colour, lw=series.width, alpha=series.alpha)
@@ -322,7 +325,7 @@ def _draw_points(axes: Axes, panel: Panel, series: Series) -> None:
         axes.scatter(series.x, series.y, series.size, marker=series.marker, alpha=series.alpha, zorder=3, **look)
 
 
-def _draw_intervals(axes: Axes, panel: Panel, series: Series) -> None:
+def _draw_intervals(axes: "Axes", panel: Panel, series: Series) -> None:
     if not len(series.low) and not len(series.high):
         return
     middle = series.x if panel.rows else series.y
@@ -335,7 +338,7 @@ def _draw_intervals(axes: Axes, panel: Panel, series: Series) -> None:
         axes.vlines(series.x, low, high, color=series.colour, lw=1, alpha=0.5 * series.alpha)
 
 
-def _draw_rule(axes: Axes, rule: Rule) -> None:
+def _draw_rule(axes: "Axes", rule: Rule) -> None:
     look: dict[str, Any] = {"color": rule.colour, "ls": rule.line, "lw": rule.width}
     if rule.x is not None and rule.y is not None:
         left, ends = axes.get_xlim()[0], axes.get_ylim()
@@ -346,8 +349,11 @@ def _draw_rule(axes: Axes, rule: Rule) -> None:
         axes.axhline(rule.y, **look)
 
 
-def _entries(panels: Sequence[Panel]) -> dict[str, Line2D | Patch]:
+def _entries(panels: Sequence[Panel]) -> "dict[str, Line2D | Patch]":
     """Name → handle of the legend, in order of appearance."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
     entries: dict[str, Line2D | Patch] = {}
     for panel in panels:
         for series in panel.series:
@@ -363,7 +369,7 @@ def _entries(panels: Sequence[Panel]) -> dict[str, Line2D | Patch]:
     return entries
 
 
-def _write_labels(axes: Axes, panel: Panel) -> None:
+def _write_labels(axes: "Axes", panel: Panel) -> None:
     texts, points = [], []
     for series in panel.series:
         for i, (x, y) in enumerate(zip(series.x, series.y, strict=True)):
@@ -374,7 +380,7 @@ def _write_labels(axes: Axes, panel: Panel) -> None:
                 colour = series.colour if isinstance(series.colour, str) else SHARED
                 texts.append(axes.text(x, y, series.labels[i], fontsize=7.5, color=colour, bbox=BEHIND))
     if texts:
-        from adjustText import adjust_text  # it imports pyplot and scipy.spatial, which no start needs
+        from adjustText import adjust_text
 
         line = {"arrowstyle": "-", "color": SHARED, "lw": 0.5}
         adjust_text(texts, *zip(*points, strict=True), ax=axes, arrowprops=line, **PLACING)

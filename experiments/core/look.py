@@ -1,14 +1,17 @@
-"""The look that every chart shares: colours, settings of matplotlib, files whose bytes depend on the data alone."""
+"""The look that every chart shares: colours, settings of matplotlib, files whose bytes depend on the data alone.
+
+Modules that every start imports import matplotlib where they draw, for it takes a second.
+"""
 
 import io
 import itertools
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from matplotlib.axis import Axis
-from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator, StrMethodFormatter
+if TYPE_CHECKING:
+    from matplotlib.axis import Axis
+    from matplotlib.figure import Figure
 
 PALETTE = (
     *("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"),
@@ -68,12 +71,14 @@ def marks(names: Iterable[str]) -> dict[str, Mark]:
 
 
 def set_ticks(
-    axis: Axis, scale: str, ticks: Mapping[float, str] | None, form: str = "", *, whole: bool = False
+    axis: "Axis", scale: str, ticks: Mapping[float, str] | None, form: str = "", *, whole: bool = False
 ) -> None:
     """The ticks given, else matplotlib's, of which `whole` keeps whole numbers; formatted by `form`.
 
     On a short logarithmic axis 2 and 5 times powers of ten have ticks too, if they fit.
     """
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator, StrMethodFormatter
+
     if ticks is not None:
         axis.set_ticks(list(ticks), list(ticks.values()))
         axis.set_minor_locator(NullLocator())
@@ -91,14 +96,14 @@ def set_ticks(
         axis.set_major_formatter(StrMethodFormatter(form or "{x:g}"))
 
 
-def svg(figure: Figure) -> bytes:
+def svg(figure: "Figure") -> bytes:
     """The figure as SVG; the same figure gives the same bytes, made within `LOOK`."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None})
     return buffer.getvalue()
 
 
-def png(figure: Figure) -> bytes:
+def png(figure: "Figure") -> bytes:
     """The figure as PNG; the same figure gives the same bytes."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})

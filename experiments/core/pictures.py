@@ -4,11 +4,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LogNorm, Normalize
-from matplotlib.figure import Figure
 
 from experiments.core.look import LOOK, png, svg
 
@@ -57,6 +53,11 @@ def heatmaps(
       colour_map, size: matplotlib's colour map, inches.
       colour_bar, mark: label of a bar that explains the colours, and a value to mark on it; no bar by default.
     """
+    import matplotlib as mpl
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LogNorm, Normalize
+    from matplotlib.figure import Figure
+
     columns = min(columns, len(maps))
     lines = math.ceil(len(maps) / columns)
     scale = ScalarMappable((LogNorm if logarithmic else Normalize)(*limits), colour_map)
@@ -97,6 +98,8 @@ def image_grid(
       columns: a name per column, or none.
       cell_inch: side of a picture.
     """
+    from matplotlib.figure import Figure
+
     count = max(len(row) for row in rows.values())
     label, heading, side = 1.05, 0.25 if columns else 0.0, 0.97 * cell_inch  # the side leaves a thin gap
     width, height = label + count * cell_inch, heading + len(rows) * cell_inch
