@@ -116,9 +116,7 @@ def train(store, key, log):
 
     # SFT: imitate answers in which every sensor perceives the true level
     truth = np.stack([store.objects[contact.object_id].label_row() for contact in store.contacts])
-    certain = np.log(
-        np.eye(max(POLICY.levels))[truth] + 1e-9
-    )  # log-probabilities of the levels, [contacts, attributes, levels]
+    certain = np.log(np.eye(max(POLICY.levels))[truth] + 1e-9)  # of each level, [contacts, attributes, levels]
     perceived = np.repeat(certain[:, None], len(SENSORS), axis=1)  # the same from every sensor
     answers = AnswerFeed(POLICY, read_clips(store, imitated), perceived, batch_size=CONTACTS, questions=3, seed=0)
     params = POLICY.init(0, next(answers).touch)
