@@ -32,6 +32,8 @@ LINES: tuple[Any, ...] = ("-", "--", ":", "-.", (0, (6, 2, 1, 2, 1, 2)))
 
 LONG_AXIS = 300.0  # ends of a logarithmic axis, one over the other, beyond which its ticks are powers of ten alone
 LETTERS = 13  # an inch, of a tick or a legend
+GAP = 3  # letters from one tick to the next; the layout, which is not known yet, leaves axes narrower
+NICE = [1, 2, 2.5, 5, 10]  # steps of ticks, as matplotlib's own
 
 LOOK: dict[Any, Any] = {
     "svg.hashsalt": "touchr1-jax",  # the same data give the same file
@@ -83,15 +85,20 @@ def set_ticks(
         axis.set_ticks(list(ticks), list(ticks.values()))
         axis.set_minor_locator(NullLocator())
         return
+    low, high = axis.get_view_interval()
+    room = LETTERS * axis.axes.bbox.width / axis.axes.figure.dpi if axis is axis.axes.xaxis else math.inf
     if scale == "log":
-        low, high = axis.get_view_interval()
         fine = LogLocator(subs=(1.0, 2.0, 5.0))
         letters = sum(len(f"{tick:g}") for tick in fine.tick_values(low, high) if low <= tick <= high)
-        room = LETTERS * axis.axes.bbox.width / axis.axes.figure.dpi if axis is axis.axes.xaxis else math.inf
         axis.set_major_locator(fine if high < LONG_AXIS * low and letters <= room else LogLocator(subs=(1.0,)))
         axis.set_minor_formatter(NullFormatter())
-    elif scale == "linear" and whole:
-        axis.set_major_locator(MaxNLocator("auto", steps=[1, 2, 5, 10], integer=True))
+    elif scale == "linear":
+        counts: Iterable[Any] = ("auto",) if room == math.inf else range(min(axis.get_tick_space(), 9), 1, -1)
+        for most in counts:
+            axis.set_major_locator(MaxNLocator(most, steps=[1, 2, 5, 10] if whole else NICE, integer=whole))
+            shown = [tick for tick in axis.get_majorticklocs() if low <= tick <= high]
+            if sum(GAP + len(text) for text in axis.get_major_formatter().format_ticks(shown)) <= room:
+                break
     if form or scale != "linear":
         axis.set_major_formatter(StrMethodFormatter(form or "{x:g}"))
 

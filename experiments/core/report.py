@@ -52,8 +52,8 @@ SETTINGS = {
 
 def settings_in_words(settings: Mapping[str, Any]) -> dict[str, str]:
     """Settings as the head of a page shows them."""
-    words = {"preset": preset_in_words}
-    shown = {name: words.get(name, plain)(value) for name, value in settings.items()}
+    is_preset = lambda name: name.partition(" of ")[0] == "preset"  # of an arm, or of all
+    shown = {name: (preset_in_words if is_preset(name) else plain)(value) for name, value in settings.items()}
     named = {name: SETTINGS.get(name, (name, "{}")) for name in shown}
     return {named[name][0]: named[name][1].format(value) for name, value in shown.items()}
 

@@ -55,7 +55,7 @@ WEIGHTS, ALGORITHMS = reinforced([omitted(FULL), *FROM_SFT])
 def without_sft(trained: TrainedPolicy) -> Evaluation:
     """GRPO from fresh parameters, with the questions and steps of the arms that start from SFT."""
     params = untrained(trained.policy, trained.data, trained.seed)
-    config = dataclasses.replace(trained.config, recipe="paper")  # without the anchor, which is SFT
+    config = dataclasses.replace(trained.config, anchor=0.0)  # the anchor is SFT
     arm = make_study_arm(config, trained.policy, PUBLISHED, trained.data.prior(), WITH_TACTILE_USE)
     tuned = trained.run_grpo(arm, f"grpo/{NO_SFT}", trained.contacts(params), params)
     return trained.ask(tuned, trained.encode(params, "test"))

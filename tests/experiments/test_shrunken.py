@@ -13,6 +13,7 @@ from experiments.core.artifacts import read_json
 from experiments.core.commands import find
 from experiments.encoder.pretrain import StageOneDataConfig
 from experiments.paper.components import COMPONENTS
+from experiments.study.stages import StudySFT
 from experiments.study.study import StudyConfig
 from sensors_io.scenes.config import SceneConfig
 from tests.experiments import tiny
@@ -27,7 +28,7 @@ small = dataclasses.replace
 CAUSAL = small(tiny.MODEL.tactile, causal=True)
 IMAGES = {"frames": tiny.MODEL.frames, "image_px": tiny.MODEL.image_px}
 PROBE = ProbeConfig(folds=2, iterations=2)
-STUDY = small(tiny.STUDY, grpo_steps=1, share=False)
+STUDY = small(tiny.STUDY, grpo_steps=1, share=False, sft=StudySFT(steps=0))  # the phases of the default
 FEW = Quota(identify=8, scale=0, compose=3, compare=2, order=0, one_sensor=8, conflict=0)
 SHARED = {field.name: getattr(tiny.STUDY, field.name) for field in dataclasses.fields(StudyConfig)}
 CONTROLS = ["sft", "sft_continued"]
@@ -194,8 +195,8 @@ RUNS = {
         lambda m, r: r["requirements"][0]["met"] and [row[2] for row in rows(r, 4)] == [8, 3, 2, 8],
     ),
     "pareto_sft": Shrunk(
-        lambda m: m.ParetoSFTConfig(study=tiny.STUDY, end_to_end=(1, 2), decoder=(1, 2)),
-        lambda m, r: [row[:2] for row in rows(r)] == [[1, 1], [1, 2], [2, 1], [2, 2]],
+        lambda m: m.ParetoSFTConfig(study=tiny.STUDY, encoders=(1,), end_to_end=(2,), decoder=(1, 2)),
+        lambda m, r: [row[:3] for row in rows(r)] == [[m.HEAD, 1, 1], [m.HEAD, 1, 2], [m.WHOLE, 2, 1], [m.WHOLE, 2, 2]],
     ),
     "qualitative": Shrunk(
         lambda m: m.QualitativeConfig(study=small(STUDY, seeds=1), quota=FEW),

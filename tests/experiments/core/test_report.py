@@ -9,7 +9,7 @@ import pytest
 
 from experiments.core.artifacts import write_text
 from experiments.core.look import PALETTE, SYMBOLS
-from experiments.core.report import is_best, pieces, word_columns, write_report
+from experiments.core.report import is_best, pieces, settings_in_words, word_columns, write_report
 from experiments.core.results import Comparison, Estimate, Picture, Results, Trace, named_table
 from experiments.core.text import MEANINGLESS, SMOKE, bounds, number, preset_in_words
 from tests.experiments.core.test_results import FAST, SLOW
@@ -226,6 +226,10 @@ def test_a_preset_is_told_in_words():
     changed = "paper with prompts=4, buckets=(8, 12), enumerated=none, mask_truncated=True, segment_credit=False"
     words = "paper with 4 prompts a step, buckets (8, 12), enumerated none, mask truncated, no segment credit"
     assert [preset_in_words(preset) for preset in ("paper", changed)] == ["paper", words]
+    assert settings_in_words({"preset": changed, "preset of soft": changed}) == {
+        "preset": words,
+        "preset of soft": words,
+    }
 
 
 def test_a_heading_keeps_its_hyphen_on_the_line_and_an_empty_answer_is_told(tmp_path, results):
