@@ -111,12 +111,10 @@ def test_ticks_of_a_narrow_logarithmic_axis_do_not_overlap():
     assert "0.002" not in narrow
 
 
-def test_a_narrow_axis_has_fewer_ticks():
-    panel = Panel([Series(x=[0.0025, 0.0175], y=[0, 1])])
-    wide, narrow = (
-        sum(text.startswith("0.01") for text in texts(draw([panel] * n, columns=n, size=(6.0, 3.0)))) for n in (1, 4)
-    )
-    assert 0 < narrow < wide
+def test_ticks_of_a_narrow_axis_do_not_overlap():
+    drawn = texts(draw([Panel([Series(x=[0.0025, 0.0175], y=[0, 1])])] * 3))
+    assert "0.005" in drawn
+    assert "0.0025" not in drawn
 
 
 def test_a_heatmap_names_its_rows_columns_and_cells():
