@@ -65,6 +65,7 @@ def test_a_group_that_is_left_out_has_the_mean_of_the_others():
     assert {name: pytest.approx(float(share)) for name, share in shares.items()} == expected
 
 
+@pytest.mark.long
 def test_the_literal_bonus_of_a_group_that_is_left_out_is_the_mean_of_the_others(monkeypatch):
     """Its rollouts would otherwise differ, and enter the mean and the σ of the batch."""
     bonus = jnp.arange(3.0 * P).reshape(P, 3)
@@ -74,7 +75,7 @@ def test_the_literal_bonus_of_a_group_that_is_left_out_is_the_mean_of_the_others
     label = jnp.where(batch.target.asked[:, :1], BROKEN, batch.target.label)
     batch = batch.replace(target=batch.target.replace(label=label), rollout=Rollout(*drawn()))
     engine = GRPOEngine(FNS, worth, OPTIMIZER, config, None, lambda params: params, None, False)
-    group, _ = engine.rollouts(tiny.shallow_params(0), batch, FROZEN, jax.random.key(0), jax.random.key(1))
+    group, _ = jax.jit(engine.rollouts)(tiny.shallow_params(0), batch, FROZEN, jax.random.key(0), jax.random.key(1))
     left_out = ~np.asarray(group.finite)
     assert left_out.any()
     np.testing.assert_allclose(group.reward[left_out], jnp.mean(group.reward[~left_out]), rtol=1e-6)
