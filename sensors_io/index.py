@@ -10,6 +10,7 @@ contacts there are.  What the root does not state does not exist.
 
 import collections
 import dataclasses
+import hashlib
 import itertools
 import json
 import os
@@ -116,7 +117,7 @@ class Index:
             damaged.
           RecordsError: it cannot be read.
         """
-        return cls.of(root, read_root(root))
+        return cls.of(root, read_root(root)[0])
 
     @classmethod
     def of(cls, root: Place, tree: Mapping[str, Any]) -> Self:
@@ -236,8 +237,8 @@ class Index:
         temporary.replace(root / INDEX)
 
 
-def read_root(root: Place) -> dict[str, Any]:
-    """The root of an index, of a version that this code reads.
+def read_root(root: Place) -> tuple[dict[str, Any], str]:
+    """The root of an index, of a version that this code reads, and the first 16 hex digits of its file's SHA-256.
 
     Raises:
       MissingIndexError, RecordsVersionError, CorruptRecordsError, RecordsError: as `Index.read`.
@@ -246,12 +247,13 @@ def read_root(root: Place) -> dict[str, Any]:
         raise MissingIndexError(f"{root} has no {INDEX}: give the directory of a data set, or write one there first")
     path = f"{root}/{INDEX}"
     try:
-        text = local(root, INDEX).read_text()
+        data = local(root, INDEX).read_bytes()
+        text = data.decode()
         tree = json.loads(text)
         found = (tree["format"], tree["version"])  # first: another version may have another checksum
         if found in [(FORMAT, version) for version in READABLE]:
             unsealed: dict[str, Any] = unseal(text)
-            return unsealed
+            return unsealed, hashlib.sha256(data).hexdigest()[:16]
     except OSError as error:
         raise RecordsError(
             f"{path} cannot be read ({error}); make it readable, or copy it again from its source"

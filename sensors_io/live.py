@@ -14,7 +14,7 @@ import numpy as np
 from sensors_io.scenes.cards import object_cards
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.protocol import contact_key, make_contact
-from sensors_io.schema import SENSORS, ContactKey, ObjectCard, Sequence, contacts_of_split
+from sensors_io.schema import SENSORS, SPLITS, ContactKey, ObjectCard, SchemaError, Sequence
 
 
 class LiveScenes:
@@ -52,4 +52,7 @@ class LiveScenes:
         Raises:
           SchemaError: no such split.
         """
-        return contacts_of_split(self.contacts, self.objects, split)
+        if split not in SPLITS:
+            raise SchemaError(f"split is {split!r}: must be one of {', '.join(SPLITS)}; rename it")
+        of = (self.objects[key.object_id].split for key in self.contacts)
+        return np.array([i for i, one in enumerate(of) if one == split], np.int64)

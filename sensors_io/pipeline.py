@@ -196,8 +196,8 @@ def clip_batches(
       SchemaError: no contact, or one that the store does not hold; a memory for other clips or beside `workers`; rows
         that a batch does not have.
     """
-    _check_memory(memory, store, config, workers)
     rows = _checked_rows(indices, len(store))
+    _bind_memory(memory, store, config, workers)
     dataset = grain.MapDataset.source(rows).seed(seed)
     dataset = dataset.shuffle() if shuffle else dataset
     if felt and isinstance(store, RecordStore):
@@ -209,7 +209,7 @@ def clip_batches(
     whole = drop_remainder or repeat
     reader = _Reader(store, config, felt, augment or AugmentConfig())
     if felt and reader.augment.active:
-        clips = dataset.random_map(reader.change)
+        clips = dataset.random_map(reader)
     elif memory is not None:
         clips = dataset.map(lambda i: memory.get(i, lambda: reader(i), felt=felt))
     else:
@@ -272,12 +272,10 @@ def _checked_own(own: Any, batch_size: int, whole: bool) -> list[int]:
     return rows
 
 
-def _check_memory(memory: ClipMemory | None, store: Contacts, config: ClipConfig, workers: int) -> None:
+def _bind_memory(memory: ClipMemory | None, store: Contacts, config: ClipConfig, workers: int) -> None:
     if memory is None:
         return
-    if memory.contacts is None:
-        memory.contacts = store
-    if memory.contacts is not store:
+    if memory.contacts is not None and memory.contacts is not store:
         raise SchemaError(
             f"memory keeps clips of {memory.contacts}: the contacts are those of {store}, with the same numbers; make "
             "a memory for them"
@@ -287,11 +285,12 @@ def _check_memory(memory: ClipMemory | None, store: Contacts, config: ClipConfig
             f"memory keeps {memory.config} of one process: the clips are {config}, read by {workers} worker processes; "
             "make it for these clips and leave workers at 0"
         )
+    memory.contacts = store
 
 
 @dataclasses.dataclass(frozen=True)
 class _Reader:
-    """Contact index → arrays of its clip; a class, so that worker processes can be sent it."""
+    """Contact index → arrays of its clip, changed at random by `rng`; a class, so that workers can be sent it."""
 
     store: Contacts
     config: ClipConfig
@@ -307,10 +306,6 @@ class _Reader:
         else:
             clip = make_unfelt_clip(key, card, self.config)
         return clip.arrays() | {"contact": np.array(i, np.int32)}
-
-    def change(self, i: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """The clip, changed at random."""
-        return self(i, rng)
 
 
 def _clip(key: ContactKey, card: ObjectCard, config: ClipConfig, **streams: np.ndarray) -> Clip:

@@ -17,7 +17,6 @@ reads 5 to 12 times slower; WebP and FFV1 are at best a third smaller and read 2
 import dataclasses
 import datetime
 import fcntl
-import hashlib
 import os
 import pathlib
 from collections.abc import Callable, Iterable, Mapping
@@ -30,7 +29,7 @@ import numpy as np
 from sensors_io.codec import CorruptRecordsError, RecordsError, decode_sequence, encode_card
 from sensors_io.contents import Cards, PartWriter
 from sensors_io.index import INDEX, Index, MissingIndexError, Part, RecordsMeta, RecordsVersionError, read_root
-from sensors_io.remote import at_url, local, place
+from sensors_io.remote import at_url, place
 from sensors_io.schema import SPLITS, ContactKey, ObjectCard, SchemaError, Sequence
 from sensors_io.shards import Entries, ShardWriter, shard_file
 from sensors_io.tables import ContactTable
@@ -235,25 +234,27 @@ class RecordStore:
 
     def __init__(self, path: str | os.PathLike[str], *, allow_incomplete: bool = False):
         self.path = place(path)
-        self._open(read_root(self.path))
+        self._open(*read_root(self.path))
         if not self._index.complete and not allow_incomplete:
             raise IncompleteRecordsError(
                 f"{self.path} holds {len(self)} contacts and its writing has not ended; "
                 "resume the writing, or open it with allow_incomplete=True"
             )
 
-    def _open(self, root: dict[str, Any]) -> None:
+    def _open(self, root: dict[str, Any], digest: str) -> None:
+        self.digest = digest
+        """First 16 hex digits of the SHA-256 of the root, which holds the configuration and the tables' checksums."""
         self._root, self._index = root, Index.of(self.path, root)
         self._entries = Entries(self.path, "contacts", self._index.contact_shards)
         self.contacts: ContactTable = self._index.contacts
         self.objects: Mapping[str, ObjectCard] = Cards(self.path, self._index)
 
     def __getstate__(self) -> Any:
-        return self.path, self._root
+        return self.path, self._root, self.digest
 
     def __setstate__(self, state: Any) -> None:
-        self.path = state[0]
-        self._open(state[1])  # as it was, though more may have been published since
+        self.path, *opened = state
+        self._open(*opened)  # as it was, though more may have been published since
 
     def __len__(self) -> int:
         return len(self.contacts)
@@ -267,11 +268,6 @@ class RecordStore:
     def complete(self) -> bool:
         """True once writing has ended."""
         return self._index.complete
-
-    @property
-    def digest(self) -> str:
-        """First 16 hex digits of the SHA-256 of the root, which holds the configuration and the tables' checksums."""
-        return hashlib.sha256(local(self.path, INDEX).read_bytes()).hexdigest()[:16]
 
     @property
     def files(self) -> tuple[str, ...]:

@@ -266,16 +266,6 @@ def check_arrays(specs: Mapping[str, Spec], arrays: Mapping[str, np.ndarray | No
                 refuse(f"dimension {dim} must be {want} as in {source}", "align the arrays")
 
 
-def contacts_of_split(contacts: tuple[ContactKey, ...], objects: Mapping[str, ObjectCard], split: str) -> np.ndarray:
-    """Indices of the contacts whose object belongs to a split, int64, ascending.
-
-    Raises:
-      SchemaError: no such split.
-    """
-    _require(split in SPLITS, "split", split, f"must be one of {', '.join(SPLITS)}", "rename it")
-    return np.array([i for i, key in enumerate(contacts) if objects[key.object_id].split == split], np.int64)
-
-
 def _require(ok: bool, field: str, value: object, constraint: str, fix: str) -> None:
     if not ok:
         raise SchemaError(f"{field} is {value!r}: {constraint}; {fix}")

@@ -118,7 +118,7 @@ def field_images(sequence: Sequence) -> np.ndarray:
     if sequence.depth_mm is not None:
         mm[..., 2] = sequence.depth_mm
     if sequence.valid is not None:
-        mm *= sequence.valid[..., None]
+        mm = np.where(sequence.valid[..., None], mm, 0)  # whatever stands there, NaN among it
     return 128 + mm / np.float32(FIELD_MM_PER_COUNT)
 
 

@@ -15,8 +15,8 @@ from experiments.study.levels import level_report
 from experiments.study.scores import Scored, score_study, study_results, study_settings
 from experiments.study.stages import Weights
 from experiments.study.study import BLIND, SFT, SMOKE, EvalVariant, Study, StudyConfig, run_study
-from experiments.study.training import GRPO_ATTRIBUTES
 from sensors_io.schema import ATTRIBUTES
+from touchr1_jax.bench.metrics import ORDINAL
 from touchr1_jax.rl.config import AnyAlgorithm, preset_name
 from touchr1_jax.training.evaluation import Evaluation, rewards_of
 from touchr1_jax.training.loop import HELD_OUT
@@ -31,7 +31,7 @@ SFT_CURVES: Mapping[str, tuple[str, ...]] = {
 }
 """Of the phases of SFT the scalars that are drawn."""
 
-OWN_REWARD = "reward_trained"  # an arm's reward under its own weights, on what GRPO asks about
+OWN_REWARD = "reward_trained"  # an arm's reward under its own weights, on ordinal questions
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -42,7 +42,7 @@ class Ablation:
       arms: reward weights of each arm.
       pairs: arms to compare, each with the one it is compared against.
       algorithms: of the arms that train by another algorithm than the configured one.
-      variants: further evaluations of SFT or of arms, by the names of their answers.
+      variants: further evaluations of SFT, the control or arms, by the names of their answers.
       curves: scalars of GRPO that are drawn.
       example: the arm whose rollouts are shown; empty for the last.
     """
@@ -126,8 +126,8 @@ def over_seeds(ablation: Ablation, study: Study, scored: Scored) -> list[Compari
 
 
 def own_reward(study: Study, seeds: Sequence[Evaluation], weights: Weights) -> Estimate:
-    """Mean reward under an arm's own weights of greedy answers to what GRPO asks, of every seed; without interval."""
-    asked = [i for i, name in enumerate(ATTRIBUTES) if name in GRPO_ATTRIBUTES]
+    """Mean reward under an arm's own weights of greedy answers to ordinal questions, of every seed; no interval."""
+    asked = [ATTRIBUTES.index(name) for name in ORDINAL]
     each = tuple(
         float(rewards_of(study.policy, answers, weights, study.prior)[np.isin(answers.attribute, asked)].mean())
         for answers in seeds

@@ -25,7 +25,8 @@ class Dataset:
     `parts` maps each of `PARTS` to contact indices; no object is in two of them, but for `sft` and `grpo` where both
     learn from the same contacts.  `label` is int32 [contact, A].  Every seed reads the same clips, so `memory` keeps
     them; `threads` read those of the batches to come.  `statistics` are all contacts as the statistics stem of an
-    encoder reads them, by the side of its patches, once a stage has computed them.
+    encoder reads them, by the side of its patches, once a stage has computed them.  `has_force` says whether the force
+    of the first contact was measured, which stands for all.
     """
 
     store: RecordStore
@@ -81,9 +82,7 @@ class Dataset:
         }
 
 
-def split_parts(
-    store: RecordStore, grpo_share: float | None, seed: int = 0, left_out: Sequence[int] = ()
-) -> dict[str, np.ndarray]:
+def split_parts(store: RecordStore, grpo_share: float | None, left_out: Sequence[int] = ()) -> dict[str, np.ndarray]:
     """Contact indices of each part; a `grpo_share` of the training objects is kept from SFT for GRPO.
 
     Without a share both stages learn from all of them.  `DataError` if no object has a label, or a part no contact.
@@ -92,7 +91,7 @@ def split_parts(
     ids = np.array([store.contacts[i].object_id for i in train])
     names = np.unique(ids)
     share = 0.0 if grpo_share is None else grpo_share
-    kept = np.isin(ids, np.random.default_rng(seed).permutation(names)[: round(share * len(names))])
+    kept = np.isin(ids, np.random.default_rng(0).permutation(names)[: round(share * len(names))])
     val, test = store.contacts_of_split("val"), store.contacts_of_split("test")
     parts = {"sft": train[~kept], "grpo": train if grpo_share is None else train[kept], "val": val, "test": test}
     parts = {name: rows[~np.isin(rows, left_out)] for name, rows in parts.items()}

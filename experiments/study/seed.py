@@ -263,7 +263,7 @@ class TrainedPolicy(StudySeed):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class EvalVariant:
-    """Another evaluation, about the test contacts, of the policy named `of`, which is SFT or an arm."""
+    """Another evaluation, about the test contacts, of the policy named `of`: SFT, the control or an arm."""
 
     of: str
     evaluate: Callable[[TrainedPolicy], Evaluation]

@@ -158,7 +158,7 @@ def encode_rows(
 
 
 def noise_bank(
-    policy: TouchPolicy, params: Params, data: Dataset, *, seed: int, contacts: int = 64
+    policy: TouchPolicy, params: Params, data: Dataset, *, seed: int, contacts: int
 ) -> Float[Array, "K S N D"]:
     """Encoded noise with the statistics of some SFT contacts."""
     clips = data.batches(data.parts["sft"], batch_size=contacts, seed=seed, repeat=False)

@@ -119,7 +119,7 @@ def run_study(
       arms: reward weights of each arm.
       context: the run.
       algorithms: those of the arms that do not use the configured one.
-      variants: further evaluations of SFT and the arms, by the names of their answers.
+      variants: further evaluations of SFT, the control and the arms, by the names of their answers.
 
     Raises:
       ValueError, RewardError, SizeError, EncoderError: as `check_arms`, `check_model` and `load_encoder`.

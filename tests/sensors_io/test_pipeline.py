@@ -65,6 +65,7 @@ class TestClipMemory:
     def test_it_belongs_to_its_clips_and_its_process(self, store):
         other = ClipMemory(ClipConfig(frames=2, image_px=8, view_px=6), 10**9)
         refused(SchemaError, r"memory keeps .*frames=2", self.feed, store, other)
+        assert other.contacts is None  # what was refused does not bind it
         elsewhere = ClipMemory(SMALL, 10**9)
         self.feed(store, elsewhere)
         refused(SchemaError, "with the same numbers; make a memory", self.feed, RecordStore(store.path), elsewhere)

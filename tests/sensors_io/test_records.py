@@ -318,9 +318,11 @@ class TestTables:
 
     def test_a_pickled_store_keeps_its_contacts(self, tmp_path):
         fakes.write(tmp_path, 4)
-        sent = pickle.dumps(RecordStore(tmp_path))
+        store = RecordStore(tmp_path)
+        sent, digest = pickle.dumps(store), store.digest
         assert len(sent) < 4000
         with RecordWriter(tmp_path, meta=fakes.META, resume=True) as writer:
             writer.write_object(fakes.card(9))
             writer.write_contact([fakes.sequence(9)])
         assert len(pickle.loads(sent)) == 4
+        assert pickle.loads(sent).digest == store.digest == digest != RecordStore(tmp_path).digest

@@ -110,6 +110,7 @@ def test_field_images_have_one_fixed_scale():
     made.depth_mm[:] = 1.5
     made.valid[:] = True
     made.valid[:, 0, 0] = False
+    made.depth_mm[:, 0, 0] = np.nan
     images = field_images(made)
     assert pytest.approx(0.0118, rel=0.01) == FIELD_MM_PER_COUNT
     np.testing.assert_allclose(images[0, 2, 2], [128 + 63.5, 128 + 63.5, 255], rtol=1e-6)

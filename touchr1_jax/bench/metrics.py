@@ -85,7 +85,7 @@ METRICS: Mapping[str, Metric] = {
         unit="",
         better="higher",
         format=".4f",
-        meaning="mean total reward of the greedy answers to what GRPO asks, by the weights that the arm was trained on",
+        meaning="mean total reward of the greedy answers to ordinal questions, by the weights of the arm",
     ),
 }
 """Every metric name that a results file may hold."""

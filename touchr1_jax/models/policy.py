@@ -23,7 +23,7 @@ from touchr1_jax.models.blocked_attention import Segments
 from touchr1_jax.models.deepstack import Levels, placed, split_levels
 from touchr1_jax.models.layers import RMSNorm
 from touchr1_jax.models.lm import CompletionCaches, Decoder, DecoderConfig, PrefixCache
-from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.models.tactile_vit import TactileViTConfig, step_time
 from touchr1_jax.types import Params, TouchBatch
 
 
@@ -142,9 +142,7 @@ class Policy(nn.Module):
     def token_time(self, frame_index: Int[Array, "*n F"], frame_mask: Bool[Array, "*n F"]) -> Int[Array, "*n N"]:
         """Frame index of each pooled token: that of the first frame of its time step, −1 where the step has none."""
         c = self.config.tactile
-        by_step = lambda x: x.reshape(*x.shape[:-1], -1, c.frames_per_step)
-        index, exists = by_step(jnp.where(frame_mask, frame_index, -1)), by_step(frame_mask)
-        first = jnp.take_along_axis(index, jnp.argmax(exists, -1, keepdims=True), -1)[..., 0]
+        first = step_time(jnp.where(frame_mask, frame_index, -1), frame_mask, c.frames_per_step)
         return jnp.repeat(first, c.tokens_per_step, -1)
 
     def prefill(
@@ -309,8 +307,7 @@ def prompt_positions(
         else:
             time = touch_time[owner[begin] - 1, number[begin:end]]
             time = time if slots.step_text is None else jnp.zeros_like(time)
-            column = np.concatenate([[0], np.cumsum(np.ones(end - begin - 1, int))])
-            local = jnp.stack([time, jnp.zeros_like(time), jnp.asarray(column) - _run_start(time)])
+            local = jnp.stack([time, jnp.zeros_like(time), jnp.arange(end - begin) - _run_start(time)])
         blocks.append(base + local)
         base = base + jnp.max(jnp.where(here, local, -1), initial=-1) + 1
     return jnp.concatenate(blocks, 1)

@@ -125,8 +125,8 @@ class TactileViT(nn.Module):
         x = self._placed_patches(frames, kept)  # *n step patch D
         steps = x.shape[-3]
         step_mask = _group(frame_mask, c.frames_per_step).any(-1)
+        time = step_time(of_frames(frame_mask, frame_index), frame_mask, c.frames_per_step)
         x = x + nn.Embed(c.sensors, c.width, name="sensor")(sensor)[..., None, None, :]
-        time = _group(frame_index, c.frames_per_step)[..., 0]
         x = x + nn.Dense(c.width, name="time")(sinusoid(time, 32))[..., None, :]
         if c.use_force:
             force = _group(force_features(force_n), c.frames_per_step)
@@ -152,6 +152,14 @@ class TactileViT(nn.Module):
         if merge:
             return rest_mean(x + place, kept[..., None, :])
         return x + place[kept][..., None, :, :]
+
+
+def step_time(
+    frame_index: Int[Array, "*n F"], frame_mask: Bool[Array, "*n F"], frames_per_step: int
+) -> Int[Array, "*n step"]:
+    """Index of the first frame of each time step that exists; that of its first one where none does."""
+    index, exists = _group(frame_index, frames_per_step), _group(frame_mask, frames_per_step)
+    return jnp.take_along_axis(index, jnp.argmax(exists, -1, keepdims=True), -1)[..., 0]
 
 
 def kept_patches(

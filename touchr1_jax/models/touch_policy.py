@@ -96,7 +96,7 @@ class TouchPolicy:
 
     @functools.cached_property
     def level_tokens(self) -> LevelTokens:
-        """Token of each level, for an conclusion that is enumerated or weighted.
+        """Token of each level, for a conclusion that is enumerated or weighted.
 
         Raises:
           ValueError: a vocabulary that splits a level or a tag.

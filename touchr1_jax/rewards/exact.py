@@ -4,9 +4,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from touchr1_jax import masked
+from touchr1_jax.rewards.accuracy import UNPARSABLE
 from touchr1_jax.types import Parsed, Target
-
-UNPARSABLE = -0.1
 
 
 def exact(parsed: Parsed, target: Target) -> Float[Array, ""]:

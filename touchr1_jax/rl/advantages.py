@@ -24,15 +24,14 @@ def no_signal(
     algorithm: Algorithm, reward: Float[Array, "P G"], terms: Mapping[str, Float[Array, "P G"]]
 ) -> Bool[Array, "P"]:
     """Groups in which every advantage is 0, whatever σ is: the rewards that are compared are all equal."""
+    over_batch = lambda x: jnp.broadcast_to(zero_variance(x.reshape(-1)), x.shape[:1])
+    equal = over_batch if algorithm.advantage is Advantage.GLOBAL else zero_variance
     if algorithm.segment_credit or algorithm.advantage is Advantage.PER_REWARD:
         # equal totals may be made of different terms, which count by themselves
         if not terms:
             raise ValueError("terms is empty: must name each reward to credit it by itself; score with `make_score`")
-        return jnp.all(jnp.stack([zero_variance(term) for term in terms.values()]), axis=0)
-    reward = best_of(reward, algorithm.best_of)
-    if algorithm.advantage is Advantage.GLOBAL:
-        return jnp.broadcast_to(zero_variance(reward.reshape(-1)), reward.shape[:1])
-    return zero_variance(reward)
+        return jnp.all(jnp.stack([equal(term) for term in terms.values()]), axis=0)
+    return equal(best_of(reward, algorithm.best_of))
 
 
 def best_of(reward: Float[Array, "*p G"], k: int) -> Float[Array, "*p G"]:

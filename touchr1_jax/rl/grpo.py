@@ -244,7 +244,7 @@ class GRPOEngine:
         if algorithm.tactile_use is not TactileUse.OFF:
             bonus, metrics = tactile_use.tactile_bonus(algorithm, parsed, batch, frozen.noise, answer, control_key)
         if algorithm.tactile_use is TactileUse.LITERAL:
-            terms = {**terms, tactile_use.TERM: algorithm.tactile_weight * bonus}
+            terms = {**terms, tactile_use.TERM: neutralised(algorithm.tactile_weight * bonus, finite)}
             reward = reward + terms[tactile_use.TERM]
         levels = None
         if algorithm.enumerated is not None and self.levels is not None:

@@ -106,8 +106,9 @@ def make_answer(
     fns: PolicyFns, parser: Callable[[Int[Array, "T"]], Parsed], length: int, constraint: Constraint | None = None
 ) -> Callable[[Params, GRPOBatch], GreedyAnswers]:
     """Build the jitted (params, batch) → greedy answers of at most `length` tokens, under a constraint if any."""
-    of: dict[str, Any] = {"length": length, "end_ids": fns.end_ids, "pad_id": fns.pad_id, "constraint": constraint}
-    draw = SampleConfig(group=1, greedy=True, **of)
+    draw = SampleConfig(
+        group=1, length=length, end_ids=fns.end_ids, pad_id=fns.pad_id, greedy=True, constraint=constraint
+    )
 
     def answer(params: Params, batch: GRPOBatch) -> GreedyAnswers:
         tokens = sample_group(fns, params, batch, jax.random.key(0), draw).tokens[:, 0]

@@ -105,7 +105,7 @@ def bonus_metrics(
 ) -> dict[str, Array]:
     """Share of groups whose rollouts earn different bonuses, and of those among them whose advantages ignore it."""
     if algorithm.tactile_use is TactileUse.LITERAL:
-        reward = reward - algorithm.tactile_weight * bonus
+        reward = reward - terms[TERM]
         terms = {name: term for name, term in terms.items() if name != TERM}
     moved = jnp.max(jnp.abs(advantage - advantages(algorithm, reward, terms)), -1)
     differs = ~zero_variance(bonus)

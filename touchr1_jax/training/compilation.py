@@ -90,14 +90,9 @@ def committed(tree: Any) -> Any:
     return jax.tree.map(place, tree)
 
 
-def remove_half_written(folder: Path, older_than_s: float = 60.0) -> int:
-    """Remove entries of a cache that lack the time of their last use, which JAX writes last; their number.
-
-    Args:
-      folder: where the entries lie.
-      older_than_s: younger ones may be in the making.
-    """
-    before, removed = time.time() - older_than_s, 0
+def remove_half_written(folder: Path) -> int:
+    """Remove entries of a cache that lack the time of their last use, which JAX writes last; their number."""
+    before, removed = time.time() - 60.0, 0  # younger ones may be in the making
     for entry in folder.glob("*-cache"):
         used = entry.with_name(f"{entry.name.removesuffix('-cache')}-atime")
         with contextlib.suppress(FileNotFoundError):  # another process removed it meanwhile

@@ -194,7 +194,8 @@ def reward_terms(
     """
     truth = evaluation.label if evaluation.truth is None else evaluation.truth
     target = policy.target(evaluation.attribute, truth, evaluation.streams)
-    score = reward_program(tuple(weights.items()), prior.tobytes(), prior.shape, policy.tokenizer.decode)
+    shares = np.asarray(prior, np.float32)
+    score = reward_program(tuple(weights.items()), shares.tobytes(), shares.shape, policy.tokenizer.decode)
     groups_of_one = jax.tree.map(lambda x: jnp.asarray(x)[:, None], (evaluation.parsed, evaluation.tokens))
     return jax.tree.map(lambda x: x[:, 0], jax.device_get(score(*groups_of_one, target)))
 

@@ -140,7 +140,7 @@ class AnswerFeed(Feed):
         most likely to each sensor alone, `compare` the one most likely to the shown sensors together, `conclude` the
         label.
       batch_size: contacts of a whole batch.
-      questions: Q.
+      questions: Q, at most one about each attribute.
       seed: of the questions.
       blind: show no touch.
       easy_steps: batches within which the share of questions that show all sensors falls to `FULL_SHARE`.
@@ -149,7 +149,7 @@ class AnswerFeed(Feed):
       own: rows of a batch that this process reads; all by default.
 
     Raises:
-      ValueError: a weight of the conclusion where a level is several tokens.
+      ValueError: more questions than the policy has; a weight of the conclusion where a level is several tokens.
     """
 
     def __init__(
@@ -167,6 +167,10 @@ class AnswerFeed(Feed):
         packing: Packing | None = None,
         own: np.ndarray | None = None,
     ) -> None:
+        if questions > len(policy.layout.ids):
+            raise ValueError(
+                f"questions is {questions}: must be at most {len(policy.layout.ids)}, one for each attribute; lower it"
+            )
         super().__init__(clips, seed)
         self._batch_size, self._own = batch_size, np.arange(batch_size) if own is None else own
         self._policy, self._evidence, self._blind = policy, evidence, blind

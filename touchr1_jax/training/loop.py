@@ -17,6 +17,7 @@ from touchr1_jax.skipping import count_skipped
 from touchr1_jax.training.checkpoint import Checkpoints
 from touchr1_jax.training.compilation import committed, return_memory
 from touchr1_jax.types import SAMPLE, StepSample
+from touchr1_jax.validation import at_least
 
 Step = Callable[..., tuple[Any, dict[str, jax.Array]]]
 """(state, batch, *constants) → (state, metrics), jitted; it may donate its state."""
@@ -58,10 +59,8 @@ class LoopConfig:
     most_skipped: int = 10
 
     def __post_init__(self) -> None:
-        for field, least in (("steps", 0), ("save_every", 1), ("most_skipped", 1)):
-            value = getattr(self, field)
-            if value < least:
-                raise ValueError(f"{field} is {value}: must be at least {least}; raise it")
+        at_least(self, 0, "steps")
+        at_least(self, 1, "save_every", "most_skipped")
 
 
 @dataclasses.dataclass
@@ -222,6 +221,7 @@ def fit_best(
 
     Raises:
       ValueError: `held_out` without checkpoints.
+      CheckpointError: the best checkpoint is damaged.
       NonFiniteGradientError: as `fit`.
     """
     if held_out is not None and hooks.checkpoints is None:

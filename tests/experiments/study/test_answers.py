@@ -33,6 +33,9 @@ def test_the_terms_of_a_reward_sum_to_the_total(policy, data, said):
     assert set(terms) == set(WEIGHTS)
     np.testing.assert_allclose(np.sum(list(terms.values()), 0), total, atol=1e-6)
     np.testing.assert_allclose(rewards_of(policy, said, WEIGHTS, prior), total, atol=1e-6)
+    np.testing.assert_array_equal(
+        rewards_of(policy, said, WEIGHTS, prior.astype(float)), rewards_of(policy, said, WEIGHTS, prior)
+    )
     assert np.ptp(np.asarray(total)) > 0.1
 
 

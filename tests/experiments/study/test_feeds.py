@@ -304,6 +304,11 @@ def test_blocks_have_one_size_and_tell_how_many_rows_are_real():
     assert list(equal_blocks(0, 3)) == []
 
 
+def test_a_contact_is_not_asked_more_questions_than_there_are(answers):
+    with pytest.raises(ValueError, match="questions is 5: must be at most 4"):
+        answers(questions=5)
+
+
 def test_the_order_of_questions_is_not_made_ahead(questions):
     """Grain's threads would shuffle 500 batches beside the training that they are for."""
     before = set(threading.enumerate())

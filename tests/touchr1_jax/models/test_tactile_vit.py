@@ -124,15 +124,16 @@ def test_every_input_reaches_the_tokens():
 
 
 def test_frames_that_do_not_exist_hold_nothing():
-    """Padding of a clip, inside a step and a whole step: other pixels, forces and indices there change no bit."""
+    """Frames inside a step, the first of one, a whole step: other pixels, forces and indices there change no bit."""
     batch, params = tiny.touch_batch(0), tiny.params()
     mask = batch.frame_mask.copy()
-    mask[0, 0, 1], mask[0, 1, 2:] = False, False
+    mask[0, 0, 1:3], mask[0, 1, 2:] = False, False
     short = batch.replace(frame_mask=mask)
     other = tiny.touch_batch(1)
     filled = short.replace(
         frames=np.where(mask[..., None, None, None], batch.frames, other.frames),
         force_n=np.where(mask[..., None], batch.force_n, other.force_n),
+        frame_index=np.where(mask, batch.frame_index, 99),
     )
     ours, theirs = encode(params, short), encode(params, filled)
     np.testing.assert_array_equal(ours, theirs)

@@ -134,6 +134,16 @@ def test_a_token_is_credited_with_what_is_not_settled_before_it():
     assert not no_signal(algorithm, jnp.ones((1, 2)), {"a": a[:, :2], "b": 1 - a[:, :2]}).any()
 
 
+def test_credited_segments_compared_over_the_batch_have_signal_though_groups_are_constant():
+    """Also groups of one rollout, which only the batch compares."""
+    reward = jnp.array([[1.0], [0.0]])
+    algorithm = Paper(advantage=Advantage.GLOBAL, segment_credit=True)
+    found = segment_advantages(algorithm, reward, {"a": reward}, {}, jnp.zeros((2, 1, 3), int))
+    assert (found != 0).all()
+    assert not no_signal(algorithm, reward, {"a": reward}).any()
+    assert no_signal(algorithm, jnp.ones((2, 1)), {"a": jnp.ones((2, 1))}).all()
+
+
 def test_a_bonus_after_normalisation_is_centred_in_its_own_group():
     found = added_after(jnp.array([[0.1, 0.1, 0.0], [0.1, 0.0, 0.0]]), 3.0)
     np.testing.assert_allclose(found, [[0.1, 0.1, -0.2], [0.2, -0.1, -0.1]], atol=1e-7)

@@ -10,12 +10,14 @@ import pytest
 
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.rl.test_grpo import FNS, FROZEN, P, score
+from touchr1_jax.rl import tactile_use
 from touchr1_jax.rl.advantages import advantages, of_kept_groups
-from touchr1_jax.rl.config import Advantage, GRPOConfig, Paper
-from touchr1_jax.rl.grpo import make_grpo_step, start_state
+from touchr1_jax.rl.config import Advantage, GRPOConfig, Paper, TactileUse
+from touchr1_jax.rl.grpo import GRPOEngine, make_grpo_step, start_state
 from touchr1_jax.rl.scoring import left_out_groups
 from touchr1_jax.rl.update import finite_update
 from touchr1_jax.skipping import count_skipped, skip_nonfinite
+from touchr1_jax.types import Rollout
 
 CONFIG = GRPOConfig(prompts=P, group=3, length=4, micro_prompts=2, algorithm=Paper(gamma=0.0))
 OPTIMIZER = optax.adam(0.05)
@@ -61,6 +63,28 @@ def test_a_group_that_is_left_out_has_the_mean_of_the_others():
     np.testing.assert_allclose(terms["b"], [[0.1, 0.1], [0.05, 0.05], [0.0, 0.0]], rtol=1e-6)
     expected = {"nonfinite_in_a": 0, "nonfinite_in_b": 1 / 3, "nonfinite_in_total": 0}
     assert {name: pytest.approx(float(share)) for name, share in shares.items()} == expected
+
+
+@pytest.mark.long
+def test_the_literal_bonus_of_a_group_that_is_left_out_is_the_mean_of_the_others(monkeypatch):
+    """Its rollouts would otherwise differ, and enter the mean and the σ of the batch."""
+    bonus = jnp.arange(3.0 * P).reshape(P, 3)
+    monkeypatch.setattr(tactile_use, "tactile_bonus", lambda *given: (bonus, {}))
+    config = dataclasses.replace(CONFIG, algorithm=Paper(gamma=0.0, tactile_use=TactileUse.LITERAL))
+    batch = tiny.question_batch(1, P)
+    label = jnp.where(batch.target.asked[:, :1], BROKEN, batch.target.label)
+    batch = batch.replace(target=batch.target.replace(label=label), rollout=Rollout(*drawn()))
+    engine = GRPOEngine(FNS, worth, OPTIMIZER, config, None, lambda params: params, None, False)
+    group, _ = jax.jit(engine.rollouts)(tiny.shallow_params(0), batch, FROZEN, jax.random.key(0), jax.random.key(1))
+    left_out = ~np.asarray(group.finite)
+    assert left_out.any()
+    np.testing.assert_allclose(group.reward[left_out], jnp.mean(group.reward[~left_out]), rtol=1e-6)
+
+
+def drawn():
+    """Tokens of every prompt's group, their log-probabilities and their mask."""
+    tokens = tiny.completions(0, P, 3, 4)
+    return tokens, jnp.zeros(tokens.shape), jnp.ones(tokens.shape, bool)
 
 
 @pytest.mark.long
