@@ -242,9 +242,13 @@ def test_every_experiment_runs_shrunken_here_or_elsewhere():
     assert not RUNS.keys() & ELSEWHERE
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[] if run.quick else pytest.mark.slow) for n, run in RUNS.items()]
-)
+def marks(name: str) -> list[pytest.MarkDecorator]:
+    """The flagship's family is in every CI run."""
+    paper = find("experiments")[name].module.startswith("experiments.paper.")
+    return [] if RUNS[name].quick else [pytest.mark.long if paper else pytest.mark.slow]
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=marks(name)) for name in RUNS])
 def test_the_experiment_runs_shrunken(name, tmp_path, cache_dir):
     run, module = RUNS[name], importlib.import_module(find("experiments")[name].module)
     directory = run_shrunk(module, run.config(module), tmp_path, "--cache-dir", str(cache_dir))
