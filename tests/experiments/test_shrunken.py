@@ -184,7 +184,7 @@ RUNS = {
             labelled=(4, 6), unlabelled=3,
             pretrain=small(m.SMOKE.pretrain, encoder=CAUSAL, **IMAGES),
         ),
-        lambda m, r: len(r["arms"]) == 2 * 2 * 4,
+        lambda m, r: len(r["arms"]) == 2 * 2 * len(m.METHODS),
     ),
     "grpo_verdict": Shrunk(
         lambda m: small(m.SMOKE, **SHARED | {"grpo": m.SMOKE.grpo, "fresh": small(tiny.SCENES, seed=9)}),
