@@ -217,7 +217,7 @@ def turns_table(title: str, others: Others) -> Table:
 def memory_table(title: str, found: Mapping[str, ProcessTiming]) -> Table:
     """Memory and time of variants, each in a process that compiles its program."""
     rows = [
-        {"way": name, "first iteration": a.first_s, "an iteration": a.median_s, "peak memory": a.peak_gb}
+        {"variant": name, "first iteration": a.first_s, "an iteration": a.median_s, "peak memory": a.peak_gb}
         for name, a in found.items()
     ]
     units = {"first iteration": "s", "an iteration": "s", "peak memory": "GB"}

@@ -206,7 +206,7 @@ def decoder_table(decode: Mapping[str, np.ndarray]) -> Table:
     """Time of one message by every method."""
     cached = np.median(decode[CACHED])
     rows = [
-        {"way": name, "median": m, "p95": float(np.quantile(ms, 0.95)), "against cached": float(m / cached)}
+        {"method": name, "median": m, "p95": float(np.quantile(ms, 0.95)), "against cached": float(m / cached)}
         for name, ms in decode.items()
         if (m := float(np.median(ms)))
     ]
