@@ -133,9 +133,9 @@ def average_check(main: MainTable) -> StatementCheck:
         "Avg is no mean of the columns",
         "main table, Avg “over the full metric set”",
         f"Avg {average[-1]} for {OURS}",
-        f"the plain mean is {plain[-1]:.1f}; every weighted one misses some model by {miss:.2f} points or more, "
-        "rounding granted; weights free to sum to anything fit the twelve rows, but give perfection "
-        f"{perfect_average(main):.0f} points at most",
+        f"the plain mean is {plain[-1]:.1f}; every weighted mean misses at least one model by {miss:.2f} points, even "
+        "allowing for rounding; weights with any sum fit the twelve rows, but give a perfect model at most "
+        f"{perfect_average(main):.0f} points",
         miss > SOLVER_ERROR,
     )
 
@@ -173,8 +173,8 @@ def _accuracies() -> Iterator[StatementCheck]:
         "OMAE lies below the error rate",
         "main table and ablation",
         f"{OURS}: OMAE {omae}",
-        f"a wrong answer is off by a level at least, so OMAE ≥ {error:.3f}; {len(impossible)} of {len(rows)} rows are "
-        "below their bound",
+        f"a wrong answer is off by at least a level, so OMAE ≥ {error:.3f}; {len(impossible)} of {len(rows)} rows are "
+        "below this bound",
         OURS in impossible,
     )
 
@@ -187,7 +187,7 @@ def _method() -> Iterator[StatementCheck]:
         "The tactile-use reward is in no equation",
         "abstract, introduction; reward equations, ablation",
         f"credit for {', '.join(paper.ADVERTISED_TERMS)}",
-        f"weights {sum(paper.REWARD_WEIGHTS.values()):g} in all, none for {', '.join(no_term)}; no row of its own",
+        f"the weights sum to {sum(paper.REWARD_WEIGHTS.values()):g} without {', '.join(no_term)}; no ablation row",
         bool(no_term),
     )
     no_value = [name for name in paper.OBJECTIVE_NEEDS if name not in paper.HYPERPARAMETERS]
@@ -219,7 +219,7 @@ def _claims() -> Iterator[StatementCheck]:
         "training data and protocol",
         f"{paper.PRETRAIN_FRAMES:,} frames, then {questions:,} questions on other data",
         f"{left:,} frames are left, {training:,} without the held-out objects: {questions / training:.0f} questions "
-        "about each",
+        "about each frame",
         questions > left,
     )
     sizes = lambda billions: ", ".join(f"{size}B" for size in billions)
@@ -259,7 +259,8 @@ def _data_and_units() -> Iterator[StatementCheck]:
         "overview and acquisition",
         f"{paper.SEQUENCES:,} sequences of {paper.OBJECTS:,}+ objects, {paper.SENSORS} sensors, a press and six "
         "motions",
-        f"that makes {paper.OBJECTS * each:,}; {paper.SEQUENCES:,} are {paper.SEQUENCES / each:.0f} objects",
+        f"the protocol gives {paper.OBJECTS * each:,}; {paper.SEQUENCES:,} suffice for {paper.SEQUENCES / each:.0f} "
+        "objects",
         paper.OBJECTS * each > paper.SEQUENCES,
     )
     printed = (paper.RECORDS, paper.SEQUENCES, paper.SFT_QA, paper.RL_QA)
@@ -267,7 +268,7 @@ def _data_and_units() -> Iterator[StatementCheck]:
         "The announced release is another data set",
         "authors' page; acquisition, training data and protocol",
         ", ".join(f"{count:,} {name}" for name, count in paper.ANNOUNCED.items()),
-        f"printed are {', '.join(f'{count:,}' for count in printed)}",
+        f"the paper prints {', '.join(f'{count:,}' for count in printed)}",
         tuple(paper.ANNOUNCED.values()) != printed,
     )
     shares = {name: row[:4] for name, (row, _) in paper.VTV.items()}
@@ -277,7 +278,8 @@ def _data_and_units() -> Iterator[StatementCheck]:
         "Shares that no count gives",
         f"VTV150K table, four properties of {paper.VTV_ITEMS} questions",
         f"{', '.join(str(share) for share in shares['Ours'])} for Touch-R1",
-        f"{fit['Ours']} of its 4 are k/{paper.VTV_ITEMS} to a decimal; of the others' {4 * (len(fit) - 1)}, {others}",
+        f"{fit['Ours']} of its 4 equal k/{paper.VTV_ITEMS} to one decimal; of the others' {4 * (len(fit) - 1)}, "
+        f"{others} do",
         fit["Ours"] < 4,
         "unsupported",
     )
@@ -286,8 +288,8 @@ def _data_and_units() -> Iterator[StatementCheck]:
         "L1 worse than a grey picture's",
         "video prediction table",
         f"L1 {min(errors)} to {max(errors)}",
-        f"a constant ½ is off by ½ at most on pictures in 0–1; {sum(e > 0.5 for e in errors)} of {len(errors)} are "
-        "above, so their unit is not given",
+        f"on pictures in 0–1 a constant ½ has an L1 of at most ½; {sum(e > 0.5 for e in errors)} of {len(errors)} "
+        "values are above, so their unit is unknown",
         min(errors) > 0.5,
         "not given",
     )

@@ -8,7 +8,7 @@ later stage uses.  Measured on objects that neither training nor probes have use
 over copying the last one, and linear probes compared with those on the untrained encoder.  The averaged encoder is
 written to the run as `encoder.npz`.
 
-Cost: about twelve minutes on one core with the data, `--scale smoke` under one.
+Cost: 25 minutes in the recorded run on one core with the data, `--scale smoke` under one.
 
 Expected: a skill near .5 over copying, and .4 over the mean latent of each step, which contains the force but not the
 object.  A random encoder is a strong baseline: it computes the energies of its filters by design, and probes predict

@@ -9,7 +9,7 @@ relative to the size of the latents, the effective rank, and the skill over copy
 a metric passes its bound twice in a row and none recovers.  A run fails if the final spread between test contacts is
 below half of the spread before training.
 
-Cost: about six minutes on one core, `--scale smoke` under one.
+Cost: 13 minutes in the recorded run on one core, `--scale smoke` under one.
 
 Expected: without any guard all contacts become one point, and the alarm is raised at step 75; the two terms alone
 prevent it.  With the stop-gradient but without terms latents stay small but distinguish contacts, and there is no

@@ -7,7 +7,7 @@ Two predictors read the frames of a press up to t, one of them also the picture 
 Scores are L1, SSIM (11 × 11 Gaussian) and the distance of a tactile encoder's features.  LPIPS needs weights that may
 not be distributed: `--lpips-weights FILE.npz` adds it (see `touchr1_jax.bench.image_similarity`).
 
-Cost: about nine minutes on one core, `--scale smoke` under one.
+Cost: 16 minutes in the recorded run on one core, `--scale smoke` under one.
 
 Expected: copying the last frame is poor because contacts grow; the mean frame contains the force and not the object; a
 predictor must be better than both.  The picture shows shape but can mislead about material, so it should help early

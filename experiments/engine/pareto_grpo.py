@@ -12,7 +12,7 @@ all sampled rollouts, so that presets are comparable.
 Options of sampling, advantage, reward, lag and reference are charted one by one against the published objective in the
 small world of touch, by accuracy and time (see `experiments.engine.grpo_options`).
 
-Cost: about twenty minutes on one core, most of it compilation; `--scale smoke` under two.
+Cost: 37 minutes in the recorded run on one core, most of it compilation; `--scale smoke` under two.
 
 Expected: on policy all clipped surrogates have the same gradient, so presets differ only in their averages and weights:
 Dr. GRPO and the token means equal GRPO up to scale where all completions have one length; dynamic sampling draws twice

@@ -12,11 +12,12 @@ constant, are measured too.  Matrix products are timed in the same process, so t
 sheet.  Every shape of product of an iteration is also timed alone; on an idle machine, the sum estimates the lower
 bound of an iteration (see `matrix_floor.py`).
 
-Cost: about seven minutes on two cores, as much again for the two other engines; `--scale smoke` under one.
+Cost: half an hour in the recorded run on two cores, with both other engines; `--scale smoke` under one.
 
 Expected: time grows with the prefix, which is encoded once, four to eight times more slowly than it would if every
 rollout encoded it; repeating the prefix takes longer in proportion to the group at long prefixes, as in the other
-engines, which repeat it.  On two cores of about 240 GFLOP/s: at most .55 s at prefix 64 and 1.3 s at 512, under 1 GB.
+engines, which repeat it.  Required on two cores of about 240 GFLOP/s: at most .55 s at prefix 64 and 1.3 s at 512,
+under 1 GB.
 """
 
 import dataclasses

@@ -8,7 +8,8 @@ fails.  The library's own step trains small policies by SFT, then GRPO, in a sim
 before the runs (`experiments.engine.failures`).  The `stable` preset is trained at the same values.  Alarms are those
 of training.  Presets, bounds and parameters were chosen on seeds 100 to 109; seeds 0 to 9 are reported.
 
-Cost: about 17 minutes on one core, 12 once everything is compiled; `--scale smoke` about one, most of it compilation.
+Cost: 23 minutes in the recorded run on one core, less once everything is compiled; `--scale smoke` about one, most of
+it compilation.
 
 Expected: every failure can be provoked, and its alarm fires during training.  `stable` should fail nowhere.
 """

@@ -11,7 +11,8 @@ ways, and single bits are flipped in all files of an unfinished and a finished s
 read and the run is continued.  Bad input: about forty kinds through the public command lines.  Waiting: the share of a
 step that waits for data, at the sizes of the studies, on a CPU.
 
-Cost: about 25 minutes on one core, most of it the 200 kills; `--scale smoke` about a minute and a half.
+Cost: 111 minutes in the recorded run on one core of a busy machine, most of it the 200 kills; `--scale smoke` about
+a minute and a half.
 
 Expected: no difference in any bit; no wrong result; for every bad input an error that names the place and the fix;
 waits below 2 % of a step.

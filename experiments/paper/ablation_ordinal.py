@@ -9,7 +9,7 @@ published consistency term.  `debiased` subtracts from the ordinal credit what a
 level is favoured, and rewards consistency only where the answer is right.  All give −0.1 for an answer that cannot be
 parsed.  All are compared with the control that continues SFT for as many seconds (`sft_continued`).
 
-Cost: about 17 minutes on two cores of 215 GFLOP/s with five seeds; `--scale smoke` under two.
+Cost: about 18 minutes on two cores with five seeds; `--scale smoke` under two.
 
 Expected: ordinal credit favours the middle level, which is near both others (answering the middle earns more than
 answering low if p(low) < p(middle) + 2/3 p(high)), so `ordinal` should give more middle answers than `zero_one`.  A

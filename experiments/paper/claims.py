@@ -100,14 +100,14 @@ CLAIMS: tuple[Claim, ...] = (
         text="SFT gives the strongest initial boost",
         experiment="ablation_cumulative",
         changes=(_ladder("Avg of four", "sft", "constant", SFT_ROW, "Qwen2.5-VL-7B"),),
-        why="Answers follow touch only after SFT. The base is a constant answer here, a blind model in the paper.",
+        why="Answers follow touch only after SFT. The base is a constant answer here and a blind model in the paper.",
     ),
     Claim(
         text="The whole objective raises Avg over SFT",
         experiment="main_table",
         published=number(paper.LADDER[FULL_ROW][2] - paper.LADDER[SFT_ROW][2], "+.1f"),
         changes=(ClaimedChange(name="Avg of nine", metrics=("avg",), arm="full", against="sft"),),
-        why="GRPO with the published rewards adds nothing to SFT that was trained to its best point.",
+        why="GRPO with the published rewards adds nothing to the best SFT checkpoint.",
     ),
     Claim(
         text="GRPO is better than the same time spent on SFT",
@@ -132,7 +132,7 @@ CLAIMS: tuple[Claim, ...] = (
         text="The consistency reward raises cross-sensor consistency",
         experiment="ablation_cumulative",
         changes=(_ladder("CSC", "consistency", "ordinal", "+ Consistency Reward", "+ Ordinal Reward", csc=True),),
-        why="It rewards slots that agree: they copy each other, and the conclusions from single sensors do not change.",
+        why="It rewards equal slots: slots copy each other, and conclusions from single sensors do not change.",
     ),
     Claim(
         text="The format reward brings a small but stable gain",
@@ -153,7 +153,7 @@ CLAIMS: tuple[Claim, ...] = (
             _ladder("OMAE", "grounding", "sft", FULL_ROW, SFT_ROW, omae=True),
             _ladder("CSC", "grounding", "sft", FULL_ROW, SFT_ROW, csc=True),
         ),
-        why="Ordinal distance and consistency are rewarded, but the consistency of single sensors falls.",
+        why="Ordinal distance and consistency are rewarded, but single sensors become less consistent.",
     ),
     Claim(
         text="The gains spread over hardness, roughness, protrusion and material",
@@ -175,7 +175,7 @@ CLAIMS: tuple[Claim, ...] = (
         experiment="ablation_cumulative",
         published="no row",
         changes=(ClaimedChange(name="Avg of four", metrics=FOUR, arm="tactile_use", against="grounding"),),
-        why="In the abstract, but in no equation and no ablation; implemented here as the abstract describes it.",
+        why="The paper mentions it only in the abstract; implemented here as described there.",
     ),
     Claim(
         text="Touch overrules a misleading picture",
@@ -188,7 +188,7 @@ CLAIMS: tuple[Claim, ...] = (
                 "deceptive questions",
             ),
         ),
-        why="On objects that look like others the policy follows touch; without touch it follows the picture.",
+        why="On objects that look like another material, policies with touch follow it; others follow the picture.",
     ),
     Claim(
         text="Right answers depend on touch",
@@ -197,7 +197,7 @@ CLAIMS: tuple[Claim, ...] = (
         changes=(
             ClaimedChange(name="least loss of accuracy", path="requirements > least gain from touch, all questions"),
         ),
-        why="Accuracy falls when touch is removed, replaced by noise, or by another object's.",
+        why="Accuracy falls when touch is removed or replaced by noise or another object's touch.",
     ),
     Claim(
         text="Larger models are better in L2-EM, SOI-ρ, CSC and Avg",
@@ -225,7 +225,7 @@ CLAIMS: tuple[Claim, ...] = (
                 spec=".3f",
             ),
         ),
-        why="Better than copying. The unit of the paper's L1 is unknown, so the figures cannot be compared.",
+        why="Prediction is better than copying. The unit of the paper's L1 is unknown, so no comparison is possible.",
     ),
     Claim(
         text="Pretraining on future frames captures contact",
@@ -236,20 +236,20 @@ CLAIMS: tuple[Claim, ...] = (
                 name="linear probes over a random encoder", path="requirements > probes over a random encoder"
             ),
         ),
-        why="Latents are predicted, but probes on them are no better than on an untrained encoder.",
+        why="Latents are predicted, but probes on them are worse than on an untrained encoder.",
     ),
     Claim(
         text="Traces probe, compare and revise on their own",
         experiment="qualitative",
         published="two chosen examples",
         fixed="undecided",
-        why="SFT teaches the form of the traces here, so it cannot emerge; the report counts every case.",
+        why="Here SFT teaches the form of the traces, so the form cannot emerge; the report counts every case.",
     ),
     Claim(
         text="Touch-R1 beats GPT-4o, Octopi, SToLa and VTV-LLM",
         experiment="paper_audit",
         published="+12.6 to +24.7 Avg",
         fixed="undecided",
-        why="Neither weights, code, data nor answers are public; the gains on VTV150K lie within one run's noise.",
+        why="No weights, code, data or answers are public; the gains on VTV150K lie within one run's noise.",
     ),
 )

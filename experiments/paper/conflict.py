@@ -10,8 +10,7 @@ which questions are deceptive.  The full model (published rewards and grounding)
 without touch, and evaluated again under each control of touch: no touch, noise of the sensors' statistics, another
 object's touch, the same touch in another order.
 
-Cost: two minutes of one core after `main_table`, whose policies it evaluates, some 36 without; `--scale smoke` under
-two.
+Cost: two minutes after `main_table`, whose policies it evaluates, about 27 without; `--scale smoke` under two.
 
 Expected: the policy without touch follows the picture and is right on few deceptive questions, where it disagrees with
 those of other seeds; the full model is right in more than half of them.  Touch adds about 35 points over every control

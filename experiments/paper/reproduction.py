@@ -95,9 +95,9 @@ def summary(found: tuple[ClaimOutcome, ...]) -> str:
 
 
 SCOPE = (
-    "Ours are policies of at most 0.6 million parameters, trained from scratch on generated scenes of four sensors, "
-    "scored on objects that do not occur in training: directions can be compared, sizes cannot. Intervals are of "
-    "95 %, over seeds where arms are compared, else over objects."
+    "Our policies have at most 1.3 million parameters, are trained from scratch on generated scenes of four sensors, "
+    "and are scored on unseen objects: the direction of an effect can be compared, its size cannot. Intervals are "
+    "95 %, over seeds if arms are compared, otherwise over objects."
 )
 
 

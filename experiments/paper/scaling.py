@@ -7,11 +7,11 @@ ratios of 3, 7 and 14 billion in the paper's figure.  SFT and GRPO, with the pub
 every size on the same scenes, questions and seeds.  The policies, and policies of the same size without touch, answer
 the bench's questions about the test objects.  Learning rates and steps are those of the default size.
 
-Cost: some 45 minutes of one core with three seeds and their data, GRPO shortened to a third; the default size's SFT is
-shared with other experiments; `--scale smoke` under one minute.
+Cost: an hour of one core in the recorded run, with three seeds and their data and GRPO shortened to a third; the
+default size's SFT is shared with other experiments; `--scale smoke` under one minute.
 
-Expected: on 2,400 objects some five points from the smallest to the default, and nothing beyond: the encoder's probe
-is better than every policy here (`main_table`), so data and decoding, not size, limit the answers.
+Expected: on 2,400 objects some five points from the smallest to the default, and nothing beyond: a probe on
+touch and picture is better than every policy here (`main_table`), so data and decoding, not size, limit the answers.
 """
 
 import dataclasses
