@@ -33,6 +33,7 @@ from experiments.core.memory import require_memory
 from experiments.core.remote_runs import run_at
 from experiments.core.report import write_report
 from experiments.core.results import Results
+from experiments.core.sizes import require_sizes
 from experiments.core.stopping import Stopped, Stopping
 from experiments.core.text import MEANINGLESS, SMOKE, aligned
 from sensors_io.errors import UserError
@@ -178,6 +179,7 @@ def run_experiment(experiment: Experiment[Any], arguments: Sequence[str], about:
     try:
         command = parse(experiment, arguments, about)
         jsonable(command.config, where="config")
+        require_sizes(command.config, experiment.configs().values())
     except (ValueError, LauncherError) as error:  # a configuration refuses its own values, or one is not finite
         print_error(f"{type(error).__name__}: {error}")
         return 2
