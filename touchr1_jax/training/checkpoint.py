@@ -180,8 +180,8 @@ class Checkpoints:
     def restore(self, like: Any) -> Restored | None:
         """The newest intact checkpoint in the shapes, dtypes and placement of `like`, or `None` where there is none.
 
-        Damaged ones are renamed to `damaged-STEP` and reported, and so is one whose best before it is damaged or gone:
-        going on from it would end with another best.
+        Damaged ones are renamed to `damaged-STEP` and reported.  That the best before it is lost is reported too: it
+        matters only if no later one is as good.
 
         Raises:
           CheckpointError: it holds another tree or other shapes.
@@ -191,13 +191,13 @@ class Checkpoints:
         for step in sorted(self._manager.all_steps(), reverse=True):
             try:
                 found = self._read(step, like)
-                self._require_best(found)
             except DamagedCheckpointError as error:
                 damaged.append(step)
                 self._print(f"{error}; it is kept as {self._set_aside(step).name}")
                 self._manager.reload()
             else:
                 self._best = found.best
+                self._look_for_best(found.step)
                 return found
         if damaged:
             raise DamagedCheckpointError(
@@ -231,17 +231,13 @@ class Checkpoints:
             return True
         return score <= self._best[1] if self._better == "lower" else score >= self._best[1]
 
-    def _require_best(self, found: Restored) -> None:
-        """Raise `DamagedCheckpointError` unless the best checkpoint up to this one is whole."""
-        if found.best is None or found.best[0] == found.step:
+    def _look_for_best(self, restored: int) -> None:
+        """Say so if the best checkpoint up to the one that was restored is not whole."""
+        if self._best is None or self._best[0] == restored:
             return
-        where = self._directory / str(found.best[0])
-        changed = changed_files(where) if (where / CHECKSUMS).is_file() else ["all of it"]
-        if changed:
-            raise DamagedCheckpointError(
-                f"{self._directory / str(found.step)}: the best checkpoint before it, {where.name}, is damaged or gone "
-                f"({', '.join(changed)})"
-            )
+        where = self._directory / str(self._best[0])
+        if not where.is_dir() or changed_files(where):
+            self._print(f"{where}, the best so far, is damaged or gone: put a copy back, unless a later one is as good")
 
     def _set_aside_unscored(self) -> None:
         """Set checkpoints aside whose score is not what was saved, before Orbax ranks by it."""

@@ -228,19 +228,24 @@ class TestDamagedBest:
         path = stage / "2" / "metrics" / "metrics"
         path.unlink() if text is None else path.write_text(text)
         told = []
-        wanted = pytest.raises(
-            DamagedCheckpointError, match=r"no checkpoint is intact.*put copies back, or start again"
-        )
+        wanted = pytest.raises(DamagedCheckpointError, match=r"best of its stage: put a copy back, or move .* away")
         with Checkpoints(stage, better="higher", print_=told.append) as checkpoints, wanted:
-            checkpoints.restore(LIKE)
-        assert "2: the checksum of its score does not hold; it is kept as damaged-2" in told[0]
-        assert "the best checkpoint before it, 2, is damaged or gone (all of it); it is kept as damaged-3" in told[1]
-
-    def test_the_newest_does_not_count_without_it(self, stage):
-        shutil.rmtree(stage / "2")
-        wanted = pytest.raises(DamagedCheckpointError, match=r"no checkpoint is intact, \[3\]")
-        with Checkpoints(stage, better="higher", print_=lambda text: None) as checkpoints, wanted:
+            assert checkpoints.restore(LIKE).step == 3
             checkpoints.best(LIKE)
+        assert "2: the checksum of its score does not hold; it is kept as damaged-2" in told[0]
+        assert "2, the best so far, is damaged or gone: put a copy back, unless a later one is as good" in told[1]
+
+    @pytest.mark.parametrize("score", [4.5, 5.0])
+    def test_without_it_a_later_one_must_be_as_good(self, stage, score):
+        shutil.rmtree(stage / "2")
+        with Checkpoints(stage, better="higher", print_=lambda text: None) as checkpoints:
+            checkpoints.restore(LIKE)
+            checkpoints.save(4, LIKE, 4, score)
+            if score == 5.0:
+                assert checkpoints.best(LIKE).step == 4
+            else:
+                with pytest.raises(DamagedCheckpointError, match="best of its stage"):
+                    checkpoints.best(LIKE)
 
     def test_a_damaged_one_says_what_to_do(self, stage):
         with Checkpoints(stage, better="higher", print_=lambda text: None) as checkpoints:
