@@ -179,7 +179,6 @@ def run_experiment(experiment: Experiment[Any], arguments: Sequence[str], about:
     try:
         command = parse(experiment, arguments, about)
         jsonable(command.config, where="config")
-        require_sizes(command.config, experiment.configs().values())
     except (ValueError, LauncherError) as error:  # a configuration refuses its own values, or one is not finite
         print_error(f"{type(error).__name__}: {error}")
         return 2
@@ -217,6 +216,7 @@ def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> 
 
     Raises:
       SystemExit: code 2 after the correction of a typo, 0 after help.
+      ValueError: a number that no scale has; what a class refuses itself.
     """
     arguments = sorted(arguments, key=lambda word: not _chooses(word, experiment.config))
     configs, scale = experiment.configs(), "default"
@@ -248,7 +248,9 @@ def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> 
     options: dict[str, Any] = {"default": command(), "prog": f"{PROG} {experiment.name}", "description": about}
     options["config"] = (tyro.conf.CascadeSubcommandArgs,)
     if not {"-h", "--help", HELP_ALL} & set(arguments):
-        return tyro.cli(command, args=arguments, **options)
+        found = tyro.cli(command, args=arguments, **options)
+        require_sizes(found.config, configs.values())
+        return found
     asked = ["--help" if word == HELP_ALL else word for word in arguments]
     written = io.TextIOWrapper(io.BytesIO(), "utf-8")  # where tyro draws the boxes that `short_help` reads
     with contextlib.redirect_stdout(written), contextlib.suppress(SystemExit):

@@ -360,8 +360,8 @@ def _digests(state: Any) -> dict[str, int]:
 
 def _file_checksums(where: Path, inside: str = "") -> dict[str, int]:
     """CRC-32 of every file below a folder, or a folder inside of it, by its path in it."""
-    files = (where / inside).rglob("*")
-    files = sorted(path for path in files if path.is_file() and path.name not in (CHECKSUMS, _STAMPED))
+    paths = (where / inside).rglob("*")
+    files = sorted(path for path in paths if path.is_file() and path.name not in (CHECKSUMS, _STAMPED))
     return {path.relative_to(where).as_posix(): zlib.crc32(path.read_bytes()) for path in files}
 
 
