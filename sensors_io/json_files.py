@@ -29,6 +29,19 @@ def write_json(path: pathlib.Path, tree: Mapping[str, Any]) -> None:
     temporary.replace(path)
 
 
+def require_writable(path: pathlib.Path) -> None:
+    """Find out whether a file can be written before it is measured what to write.
+
+    Raises:
+      OSError: it is a folder, or its folder cannot be made or written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder: must be a file; name one in it")
+    if not os.access(path.parent, os.W_OK):
+        raise PermissionError(f"{path.parent} is read-only: must be writable; name another folder")
+
+
 def read_json(path: pathlib.Path) -> Any:
     """The value of a JSON file, without its checksum.
 

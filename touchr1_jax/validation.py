@@ -1,16 +1,19 @@
 """Range checks for fields of a configuration; NaN is rejected."""
 
+import math
 from typing import Any
 
 
 def at_least(config: Any, bound: float, *fields: str) -> None:
-    """Check that fields are ≥ a bound.
+    """Check that fields are ≥ a bound, and finite.
 
     Raises:
       ValueError: naming the field, its value and the bound.
     """
     for field in fields:
         value = getattr(config, field)
+        if value == math.inf:
+            raise ValueError(f"{field} is {value}: must be finite; lower it")
         if not value >= bound:
             raise ValueError(f"{field} is {value}: must be at least {bound}; raise it")
 
@@ -37,3 +40,21 @@ def within(config: Any, low: float, high: float, *fields: str) -> None:
         value = getattr(config, field)
         if not low <= value <= high:
             raise ValueError(f"{field} is {value}: must lie in {low} … {high}; change it")
+
+
+def unused(config: Any, where: str, **values: Any) -> None:
+    """Check that fields that a stage does not read have the value that changes nothing.
+
+    Args:
+      config: of the stage.
+      where: name of the field that holds it.
+      values: field → that value.
+
+    Raises:
+      ValueError: naming the field, its value and the one that it must have.
+    """
+    for field, value in values.items():
+        if (given := getattr(config, field)) != value:
+            raise ValueError(
+                f"{where}.{field} is {given}: must be {value}, for this stage does not read it; leave it out"
+            )

@@ -33,6 +33,7 @@ from touchr1_jax.training.exploration import NO_CHOICE, check_exploration, drop_
 from touchr1_jax.training.optimizer import OptimizerConfig
 from touchr1_jax.training.train_sft import SFTConfig
 from touchr1_jax.types import Params
+from touchr1_jax.validation import unused
 
 EVERY_TOUCH = "every_touch"  # the control that makes every contact; of the first seed alone
 
@@ -103,6 +104,7 @@ class LearnerConfig:
     thresholds: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8, 0.9)
 
     def __post_init__(self) -> None:
+        unused(self.warm, "warm", questions=1, pack=0, curriculum=0.0, conclusion_weight=1.0)
         for name in ("dropout", "several_dropout"):
             if not 0 <= getattr(self, name) < 1:
                 raise ConfigurationError(f"{name} is {getattr(self, name)}: must lie in 0 ≤ {name} < 1; lower it")

@@ -25,6 +25,7 @@ from touchr1_jax.models.frame_statistics import scaled_statistics
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
 from touchr1_jax.types import Params
+from touchr1_jax.validation import within
 
 
 class DrawnFeed:
@@ -72,6 +73,9 @@ class ContactEncoderConfig:
     steps: int = 1500
     batch_size: int = 256
     optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=100.0, weight_decay=0.1)
+
+    def __post_init__(self) -> None:
+        within(self, 0, 0.99, "dropout")
 
 
 class SingleContact(nn.Module):

@@ -111,9 +111,8 @@ class AskCommand(Places):
                 f"names are {self.names}: a policy that chooses its touches takes --question, at most one INPUT, and "
                 "none of --sensor, --every, --json and --html; correct them"
             )
-        return explored(
-            read_explorer(folder), given[0] if given else "", self.question, print_lines, sys.stdin.readline
-        )
+        listen = (lambda: "") if sys.stdin is None else sys.stdin.readline  # it is None where it is closed
+        return explored(read_explorer(folder), given[0] if given else "", self.question, print_lines, listen)
 
     def _every(self, policy: AskablePolicy, path: Path) -> Iterator[str]:
         """The answers about every contact as JSON lines, or the share of right ones by attribute."""

@@ -135,6 +135,9 @@ class CompareCommand:
     def run(self, package: str) -> int:
         """Print the comparison and return the exit status."""
         del package
+        if self.most < 0:
+            print_error(f"most is {self.most}: must be at least 0; raise it")
+            return 2
         from experiments.core.compare import ComparisonError, compare_runs  # SciPy, which no other command needs
 
         try:
@@ -157,12 +160,12 @@ class ShowCommand:
 
     def run(self, package: str) -> int:
         """Write the report, print its path and its verdict, and return the exit status."""
-        from experiments.core.recorded import FigureError, show_recorded  # charts, which no other command needs
-
         entries = find(package)
         if self.name not in entries:
             print_error(unknown_name(self.name, entries))
             return 2
+        from experiments.core.recorded import FigureError, show_recorded  # charts, which no other command needs
+
         try:
             lines = show_recorded(self.name, entries[self.name].module, self.runs_dir)
         except FigureError as error:

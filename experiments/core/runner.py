@@ -33,6 +33,7 @@ from experiments.core.memory import require_memory
 from experiments.core.remote_runs import run_at
 from experiments.core.report import write_report
 from experiments.core.results import Results
+from experiments.core.sizes import require_sizes
 from experiments.core.stopping import Stopped, Stopping
 from experiments.core.text import MEANINGLESS, SMOKE, aligned
 from sensors_io.errors import UserError
@@ -215,6 +216,7 @@ def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> 
 
     Raises:
       SystemExit: code 2 after the correction of a typo, 0 after help.
+      ValueError: a number that no scale has; what a class refuses itself.
     """
     arguments = sorted(arguments, key=lambda word: not _chooses(word, experiment.config))
     configs, scale = experiment.configs(), "default"
@@ -246,7 +248,9 @@ def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> 
     options: dict[str, Any] = {"default": command(), "prog": f"{PROG} {experiment.name}", "description": about}
     options["config"] = (tyro.conf.CascadeSubcommandArgs,)
     if not {"-h", "--help", HELP_ALL} & set(arguments):
-        return tyro.cli(command, args=arguments, **options)
+        found = tyro.cli(command, args=arguments, **options)
+        require_sizes(found.config, configs.values())
+        return found
     asked = ["--help" if word == HELP_ALL else word for word in arguments]
     written = io.TextIOWrapper(io.BytesIO(), "utf-8")  # where tyro draws the boxes that `short_help` reads
     with contextlib.redirect_stdout(written), contextlib.suppress(SystemExit):

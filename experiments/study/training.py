@@ -26,7 +26,7 @@ from touchr1_jax.training.optimizer import OptimizerConfig
 from touchr1_jax.training.train_encoder import EncoderTrainingConfig
 from touchr1_jax.training.train_sft import SFTConfig
 from touchr1_jax.types import Params
-from touchr1_jax.validation import at_least
+from touchr1_jax.validation import at_least, unused
 
 GRPO_SHARE = 0.35  # share of the training objects that SFT never sees under recipe `paper`
 
@@ -128,6 +128,12 @@ class TrainingConfig(SourceConfig):
                 f"sft.steps is 0: must be at least 1 where recipe {self.recipe!r} trains the encoders by nothing else; "
                 "set it, for example to 1350"
             )
+        unused(self.decoder, "decoder", pack=0, curriculum=0.0)
+        for name in ("sft", "blind", "decoder"):
+            if (questions := getattr(self, name).questions) > len(ATTRIBUTES):
+                raise ValueError(
+                    f"{name}.questions is {questions}: must be at most {len(ATTRIBUTES)}, one each; lower it"
+                )
         require_derived("tactile.sensors", self.model.tactile.sensors)
         if self.grpo.length != self.model.completion_tokens:
             raise ValueError(

@@ -54,6 +54,14 @@ class CalibrateConfig:
     sure_cover: float = 0.8
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        least = {"least_presses": 2, "folds": 2, "repeats": 1}
+        for name, value in dataclasses.asdict(self).items():
+            if isinstance(value, tuple) and not 0 <= value[0] < value[1]:
+                raise ValueError(f"{name} is {value}: must be two numbers that rise from 0 or above; correct it")
+            if not isinstance(value, tuple) and not value >= least.get(name, 0):
+                raise ValueError(f"{name} is {value}: must be ≥ {least.get(name, 0)}; raise it")
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class UnusedPress:

@@ -42,6 +42,8 @@ class GuideConfig:
         for field in dataclasses.fields(self):
             if not getattr(self, field.name) > 0:
                 raise ValueError(f"{field.name} is {getattr(self, field.name)}: must be > 0; raise it")
+        if self.cover > 1:
+            raise ValueError(f"cover is {self.cover}: must be ≤ 1, a share; lower it")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -12,6 +12,7 @@ from sensors_io.commands.console import OUT, live_display
 from sensors_io.devices.errors import StreamEndedError
 from sensors_io.devices.reader import Reader
 from sensors_io.force import ForceError
+from sensors_io.json_files import require_writable
 from sensors_io.poses import ForceZero, PoseConfig, PoseFinder, PoseReading, fit_poses
 
 _LOOK_S = 0.02  # between two looks at the readings
@@ -37,6 +38,7 @@ class ForceZeroing(Bench):
     def run(self) -> int:
         if self.poses < 4:
             raise ForceError(f"poses is {self.poses}: must be ≥ 4, a sphere has four unknowns; hold six or more")
+        require_writable(self.out)
         with stop_on_interrupt() as stop, readers((self.device,), numbers=True) as (sensor,):
             finder = PoseFinder(self.still)
             end_s = time.monotonic() + self.wait_s

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import functools
 import pathlib
+import re
 from typing import Annotated
 
 import cv2
@@ -16,7 +17,7 @@ from sensors_io.commands.console import OUT
 from sensors_io.devices.base import Device
 from sensors_io.devices.errors import DeviceNotFoundError, DeviceTimeoutError, StreamEndedError
 from sensors_io.fields.sources import read_picture
-from sensors_io.fields.types import CalibrationError
+from sensors_io.fields.types import CalibrationError, write_whole
 from sensors_io.viewer.server import LiveView, Numbers
 
 _TIMEOUT_S = 2.0  # for one frame
@@ -47,7 +48,7 @@ class Snap(Bench):
             stop = stack.enter_context(stop_on_interrupt())
             device = stack.enter_context(opened(self.device))
             pitch = self.mm_per_px or device.identity.mm_per_px
-            if not pitch or not self.ball_diameter_mm > 0:
+            if not (pitch and pitch > 0 and self.ball_diameter_mm > 0):
                 raise CalibrationError(
                     f"mm_per_px is {pitch}, ball_diameter_mm {self.ball_diameter_mm:g}: both must be > 0; measure them "
                     "(mm_per_px: width of the gel that the picture shows over its pixels)"
@@ -83,17 +84,29 @@ class Snap(Bench):
             return PressGuide(self.ball_diameter_mm / 2, pitch, self.config)
         guide = PressGuide(self.ball_diameter_mm / 2, pitch, self.config, read_picture(self._background))
         for path in sorted((self.out / "presses").glob("*.png")):
-            guide.resume(read_picture(path))
+            press = read_picture(path)
+            self._require_size(guide, press, str(path))
+            guide.resume(press)
         return guide
+
+    def _require_size(self, guide: PressGuide, picture: np.ndarray, of: str) -> None:
+        """Refuse a picture of another size than that of the gel at rest."""
+        if guide.background is not None and picture.shape != guide.background.shape:
+            (height, width), (rows, columns) = guide.background.shape[:2], picture.shape[:2]
+            raise CalibrationError(
+                f"{of} is {columns} × {rows}, {self._background} {width} × {height}: must be equal; give the camera "
+                "that size again, or choose another --out"
+            )
 
     def _see(self, guide: PressGuide, frame: np.ndarray) -> Guidance:
         """One frame; what it completes is written."""
+        self._require_size(guide, frame, "the camera's picture")
         resting = guide.background is None
         guidance = guide.look(frame)
         if resting and guide.background is not None:
             _write(self._background, guide.background)
         if guidance.taken is not None:
-            _write(self.out / "presses" / f"press_{len(guide.touches):03d}.png", guidance.taken)
+            _write(_free(self.out / "presses"), guidance.taken)
         return guidance
 
     def _show(self, live: LiveView, device: Device, guide: PressGuide, frame: np.ndarray, guidance: Guidance) -> None:
@@ -122,12 +135,17 @@ class Snap(Bench):
             )
 
 
+def _free(folder: pathlib.Path) -> pathlib.Path:
+    """Path of the next press: past all that are there, of which some may have been removed."""
+    found = (re.fullmatch(r"press_(\d+)", path.stem) for path in folder.glob("*.png"))
+    return folder / f"press_{max((int(one[1]) for one in found if one), default=0) + 1:03d}.png"
+
+
 def _write(path: pathlib.Path, picture: np.ndarray) -> None:
-    """A picture, RGB, as PNG.
+    """A picture, RGB, as PNG, whole or not at all.
 
     Raises:
       OSError: it cannot be written.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
-        raise OSError(f"{path} cannot be written: the folder must be writable; choose another --out")
+    _, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+    write_whole(path, data.tobytes())

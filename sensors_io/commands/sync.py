@@ -10,6 +10,7 @@ from rich.table import Table
 from sensors_io.commands.choices import Bench, readers, stop_on_interrupt
 from sensors_io.commands.console import OUT, live_display
 from sensors_io.devices.errors import StreamEndedError
+from sensors_io.json_files import require_writable
 from sensors_io.offsets import Offsets, OffsetsError
 from sensors_io.recording.signals import By, Listener, measure_offsets
 
@@ -42,6 +43,11 @@ class Sync(Bench):
         configs = (*((parts.force,) if parts.force else ()), *parts.tactile)
         if len(configs) < 2:
             raise OffsetsError("one device is named: two or more can be compared; join them by +")
+        if self.out is not None and self.check is not None:
+            raise OffsetsError(f"out is {self.out}, check {self.check}: --check writes no file; leave one of them out")
+        earlier = None if self.check is None else Offsets.load(self.check)
+        if self.out is not None:
+            require_writable(self.out)
         with stop_on_interrupt() as stop, readers(configs) as devices:
             listeners = [Listener(device) for device in devices]
             end_s = time.monotonic() + self.seconds
@@ -57,8 +63,8 @@ class Sync(Bench):
         first, *others = listeners
         signals = {listener.name: listener.signal() for listener in others}
         found = measure_offsets(first.signal(), signals, first.name, self.by)
-        if self.check is not None:
-            return self._check(found, Offsets.load(self.check))
+        if earlier is not None:
+            return self._check(found, earlier)
         OUT.print(report(found))
         if self.out is not None:
             found.save(self.out)

@@ -35,6 +35,11 @@ class ZeroConfig:
     bent: float = 0.4
     tilted: float = 0.15
 
+    def __post_init__(self) -> None:
+        for name, value in dataclasses.asdict(self).items():
+            if not value >= 0 or (name == "sinks_mm" and value == 0):
+                raise ValueError(f"{name} is {value}: must be ≥ 0, and sinks_mm above it; raise it")
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Surface:

@@ -27,3 +27,9 @@ def test_bounds(check, kept, refused, said):
     for value in refused:
         with pytest.raises(ValueError, match=f"share is {value}: {said}"):
             check(Bounded(value))
+
+
+def test_a_size_is_finite():
+    """An infinite weight makes every loss NaN, an infinite ε every advantage 0."""
+    with pytest.raises(ValueError, match="share is inf: must be finite; lower it"):
+        at_least(Bounded(math.inf), 1, "share")

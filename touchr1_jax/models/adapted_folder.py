@@ -63,10 +63,13 @@ def save_adapted(folder: Path, saved: SavedPolicy, weights: str) -> None:
       folder: where.
       saved: a policy on released weights, with adapters.
       weights: path of the released folder, absolute or from `folder` on.
+
+    Raises:
+      PolicyError: the folder holds something else too.
     """
     policy = saved.policy
     assert isinstance(policy, ReleasedPolicy)
-    with published(folder) as unfinished:
+    with published(folder, (PEFT_CONFIG, PEFT_WEIGHTS, TOUCH_FILE, CARD, CONFIG_FILE)) as unfinished:
         adapters = of_checkpoint(saved.params.get(ADAPTERS, {}))
         save_adapters(unfinished, adapters, policy.checkpoint.config, policy.fns.lora, weights)
         write_file(unfinished / TOUCH_FILE, touch_tensors(saved.params))

@@ -14,7 +14,7 @@ import json
 import os
 import shutil
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -109,11 +109,12 @@ def save_policy(folder: Path, saved: SavedPolicy, *, precision: Precision = "flo
       card: the model card; by default a table of `notes`.
 
     Raises:
-      PolicyError: the folder exists and holds something else; a parameter is beyond the range of that precision.
+      PolicyError: the folder exists and holds something else, be it beside a policy; a parameter is beyond the range
+        of that precision.
     """
     if folder.exists() and format_of(folder) != FORMAT and (not folder.is_dir() or any(folder.iterdir())):
         raise PolicyError(f"folder is {folder}: it exists and is no policy; choose a new one")
-    with published(folder) as unfinished:
+    with published(folder, (SINGLE, TOKENIZER_FILE, CARD, CONFIG_FILE)) as unfinished:
         write_file(unfinished / SINGLE, _stored(saved.params, precision))
         words = [piece.decode().strip() for piece in saved.policy.tokenizer.pieces if piece]
         (unfinished / TOKENIZER_FILE).write_text(word_library(words).to_str(pretty=True), encoding="utf-8")
@@ -122,12 +123,23 @@ def save_policy(folder: Path, saved: SavedPolicy, *, precision: Precision = "flo
 
 
 @contextlib.contextmanager
-def published(folder: Path) -> Iterator[Path]:
+def published(folder: Path, parts: Collection[str] = ()) -> Iterator[Path]:
     """A new folder that takes the place of `folder` if the block ends without an error, and else vanishes.
 
     Until the new one is in place the old one stays, or is put back.  A link is followed.
+
+    Args:
+      folder: where.
+      parts: names of what may be replaced; nothing else that somebody put there is.
+
+    Raises:
+      PolicyError: there is something else.
     """
     folder = folder.resolve()
+    others = sorted(path.name for path in folder.glob("*") if path.name not in parts)
+    if others or folder.is_file():
+        held = f"it also holds {', '.join(others[:3])}, which would be lost" if others else "a file"
+        raise PolicyError(f"folder is {folder}: {held}; move it away, or choose a new one")
     unfinished, old = (folder.with_name(f".{folder.name}.{os.getpid()}{end}") for end in ("", ".old"))
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)

@@ -26,7 +26,7 @@ from touchr1_jax.rl.gradient import Experience
 from touchr1_jax.rl.grpo import Group, GRPOEngine, GRPOState, compile_step
 from touchr1_jax.rl.metrics import advantage_metrics
 from touchr1_jax.rl.rollout import SampleConfig
-from touchr1_jax.rl.scoring import left_out_groups
+from touchr1_jax.rl.scoring import NONFINITE_IN, left_out_groups
 from touchr1_jax.rl.touch_reward import Prices, Spent, TouchReward, priced_answer
 from touchr1_jax.rl.trajectory import ActiveBatch, Trajectories, sample_trajectories
 from touchr1_jax.types import Params
@@ -92,6 +92,10 @@ def check_active_config(fns: ActiveFns, config: GRPOConfig, budget: int) -> None
         raise ValueError(
             f"tactile_use is {algorithm.tactile_use}: must be OFF for trajectories, whose touch has a price instead"
         )
+    if algorithm.stable_rewards:
+        raise ValueError(
+            "stable_rewards is True: must be False for trajectories, whose reward is one function; leave it out"
+        )
     if algorithm.segment_credit or config.buckets:
         raise ValueError("segment_credit and buckets are for single answers: leave both out for trajectories")
 
@@ -138,7 +142,8 @@ class ActiveEngine(GRPOEngine):
         reward, terms, finite, left_out = left_out_groups(reward, terms)
         levels = None
         if self.config.algorithm.enumerated is not None and self.levels is not None:
-            levels = level_rewards(with_answer, self.levels, found.rollout.tokens, batch.target, reward, finite)
+            levels, known = level_rewards(with_answer, self.levels, found.rollout.tokens, batch.target, reward, finite)
+            finite, left_out = known, {**left_out, f"{NONFINITE_IN}levels": jnp.mean(finite & ~known)}
         seen = Explored(batch.features, found.touch, found.exists, jnp.any(found.exists, (1, 2, 3))[:, None])
         shown: dict[str, Any] = {"features": seen}
         group = Group(

@@ -162,10 +162,10 @@ class Algorithm:
         at_least(self, 0, "stale", "score_centering")
         if not 0 < self.reference_share <= 1:
             raise ValueError(f"reference_share is {self.reference_share}: must lie in 0 < share ≤ 1; 1 is no average")
-        sizes = ("clip_low", "clip_high", "epsilon", "beta", "entropy_weight", "gamma", "anchor", "tactile_weight")
-        for field in sizes:
-            if not (isinstance(getattr(self, field), jax.Array) or getattr(self, field) >= 0):
-                raise ValueError(f"{field} is {getattr(self, field)}: must be ≥ 0; it is a size, not a sign")
+        sizes = "clip_low clip_high epsilon beta entropy_weight gamma anchor tactile_weight tactile_margin"
+        for field in sizes.split():
+            if not (isinstance(getattr(self, field), jax.Array) or 0 <= getattr(self, field) < float("inf")):
+                raise ValueError(f"{field} is {getattr(self, field)}: must be ≥ 0 and finite; it is a size, not a sign")
         bounds = "importance_cap mismatch_limit grounding_cap_nat grounding_budget entropy_floor_nat trust_nat"
         for field in bounds.split():
             bound = getattr(self, field)
@@ -340,7 +340,7 @@ class GRPOConfig:
 
     def __post_init__(self) -> None:
         at_least(self, 1, "prompts", "group", "length", "micro_prompts", "max_logits")
-        at_least(self, 0, "learning_rate", "lr_scale")
+        at_least(self, 0, "learning_rate", "lr_scale", "temperature")
         within(self, 0, 1, "final_share")
         above(self, 0, "max_grad_norm", "temperature", "top_p")
         within(self, 0, 1, "top_p", "min_p")

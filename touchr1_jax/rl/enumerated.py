@@ -59,7 +59,7 @@ def level_rewards(
     target: Target,
     sampled: Float[Array, "P G"],
     finite: Bool[Array, "P"],
-) -> LevelRewards:
+) -> tuple[LevelRewards, Bool[Array, "P"]]:
     """Rewards of all completions with each level in turn as their conclusion; tokens after it stay as sampled.
 
     Args:
@@ -69,6 +69,10 @@ def level_rewards(
       target: of the prompts; one that asks for several attributes keeps its sampled rewards.
       sampled: rewards of the completions as they are.
       finite: prompts whose group counts; the rewards of others are 0.
+
+    Returns:
+      The rewards; and which prompts count: of those in `finite` the ones that earn a finite reward with every level,
+      also with those that no rollout said.
     """
     length = tokens.shape[-1]
     ids = jnp.asarray(levels.level, jnp.int32)[jnp.argmax(target.asked, -1)]  # P K
@@ -79,10 +83,12 @@ def level_rewards(
     def with_level(level: tuple[Int[Array, ""], Int[Array, "P"]]) -> Float[Array, "P G"]:
         k, word = level
         reward = reward_of(jnp.where(here, jnp.maximum(word, 0)[:, None, None], tokens), k)
-        return jnp.where((finite & (word >= 0))[:, None] & jnp.isfinite(reward), reward, 0.0)
+        return jnp.where((finite & (word >= 0))[:, None], reward, 0.0)
 
     reward = jnp.moveaxis(jax.lax.map(with_level, (jnp.arange(ids.shape[1]), ids.T)), 0, -1)
-    return LevelRewards(ids=ids, at=at, reward=reward, sampled=sampled)
+    finite &= jnp.all(jnp.isfinite(reward), (-2, -1))
+    reward = jnp.where(finite[:, None, None], reward, 0.0)
+    return LevelRewards(ids=ids, at=at, reward=reward, sampled=sampled), finite
 
 
 def conclusion_place(tokens: Int[Array, "*n T"], opens: int) -> Int[Array, "*n"]:

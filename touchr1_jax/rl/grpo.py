@@ -48,7 +48,14 @@ from touchr1_jax.rl.metrics import (
     touch_metrics,
 )
 from touchr1_jax.rl.rollout import GRPOBatch, SampleConfig, encode_prompts, sample_prompts
-from touchr1_jax.rl.scoring import ScoreFn, WeightedScore, left_out_groups, neutralised
+from touchr1_jax.rl.scoring import (
+    NONFINITE_IN,
+    ScoreFn,
+    WeightedScore,
+    left_out_groups,
+    neutralised,
+    require_stable_rewards,
+)
 from touchr1_jax.rl.update import update_policy
 from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.text.template import LevelTokens
@@ -150,8 +157,8 @@ def make_grpo_step(
 
     Raises:
       ValueError: an algorithm that samples constrained, without a constraint; one that enumerates conclusions, without
-        the tokens of the levels; one that credits segments, with a score that `make_score` did not make; lean
-        compilation where jax has none.
+        the tokens of the levels; one that credits segments, with a score that `make_score` did not make; one
+        with stable rewards, with a score of published ones; lean compilation where jax has none.
     """
     if config.lean_compilation and not compiles_leanly():
         raise ValueError(
@@ -166,6 +173,8 @@ def make_grpo_step(
         raise ValueError("constrained is True, but there is no constraint; make one with `compile_constraint`")
     if config.algorithm.enumerated is not None and levels is None:
         raise ValueError("enumerated is set, but there are no tokens of levels; make them with `level_tokens`")
+    if config.algorithm.stable_rewards:
+        require_stable_rewards(score)
     if config.bfloat16:
         fns = dataclasses.replace(fns, cache_dtype=jnp.dtype(jnp.bfloat16))
     return compile_step(GRPOEngine(fns, score, optimizer, config, constraint, gather, levels, sampled), config)
@@ -249,7 +258,8 @@ class GRPOEngine:
         levels = None
         if algorithm.enumerated is not None and self.levels is not None:
             reward_of = lambda tokens, level: score(tokens, batch.target)[0]
-            levels = level_rewards(reward_of, self.levels, rollout.tokens, batch.target, reward, finite)
+            levels, known = level_rewards(reward_of, self.levels, rollout.tokens, batch.target, reward, finite)
+            finite, left_out = known, {**left_out, f"{NONFINITE_IN}levels": jnp.mean(finite & ~known)}
         return Group(batch, rollout, parsed, reward, terms, finite, bonus, levels), metrics | left_out
 
     def draw(self, group: int) -> SampleConfig:
@@ -311,6 +321,7 @@ class GRPOEngine:
             weight = prompt_weights(~no_signal)
         if algorithm.average is Average.BATCH:
             weight = over_tokens(weight, rollout.mask)
+        weight = jnp.where(group.finite, weight, 0.0)  # where conclusions are enumerated, no advantage of 0 does it
         masked_touch, stream = perturbed
         return Experience(
             batch=batch,

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax import masked
-from touchr1_jax.rewards import stable_weights
+from touchr1_jax.rewards import STABLE, stable_weights
 from touchr1_jax.rewards.base import AnyReward, Decode, Reward, total_reward
 from touchr1_jax.rewards.proof import prove_rewards
 from touchr1_jax.rl.advantages import segment_advantages
@@ -25,6 +25,20 @@ ScoreFn = Callable[[Int[Array, "T"], Target], tuple[Float[Array, ""], dict[str, 
 def reward_weights(algorithm: Algorithm, weights: Mapping[str, float]) -> dict[str, float]:
     """Weights of the rewards that train by an algorithm: under `stable_rewards` those of their stable forms."""
     return stable_weights(weights) if algorithm.stable_rewards else dict(weights)
+
+
+def require_stable_rewards(score: object) -> None:
+    """Refuse a score that weighs a reward in its published form, which answers without touch outwit.
+
+    Raises:
+      ValueError: it names the rewards.
+    """
+    published = sorted(STABLE.keys() & score.weights.keys()) if isinstance(score, WeightedScore) else []
+    if published:
+        raise ValueError(
+            f"stable_rewards is True, but the score weighs {', '.join(published)}: must weigh their stable forms; make "
+            "it of `reward_weights(algorithm, weights)`, or set stable_rewards False"
+        )
 
 
 NONFINITE_IN = "nonfinite_in_"
@@ -98,14 +112,17 @@ def left_out_groups(
 ) -> tuple[Float[Array, "D G"], dict[str, Float[Array, "D G"]], Bool[Array, "D"], dict[str, Float[Array, ""]]]:
     """Take groups with a NaN or infinite reward out: theirs becomes the mean of all others, which teaches nothing.
 
+    So are groups whose rewards have no finite sum of squares: no σ could be told, and all advantages would be 0.
+
     Returns:
       Reward and terms without such numbers, true for each group that stays, and by `nonfinite_in_TERM` the share of
-      groups in which a term was not finite (`nonfinite_in_total` where every term was, but not their sum).
+      groups in which a term was not finite (`nonfinite_in_total` where every term was, but not their sum or its
+      square).
     """
     is_finite = lambda x: jnp.all(jnp.isfinite(x), -1)
     by_term = {name: is_finite(term) for name, term in terms.items()}
     all_terms = functools.reduce(jnp.logical_and, by_term.values(), jnp.ones(reward.shape[:1], bool))
-    finite = all_terms & is_finite(reward)
+    finite = all_terms & jnp.isfinite(jnp.sum(reward**2, -1))
     neutral = lambda x: neutralised(x, finite)
     shares = {f"{NONFINITE_IN}{name}": jnp.mean(~each) for name, each in by_term.items()}
     shares[f"{NONFINITE_IN}total"] = jnp.mean(all_terms & ~finite)

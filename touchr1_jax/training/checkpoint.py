@@ -56,11 +56,12 @@ class DamagedCheckpointError(CheckpointError):
 
 
 class Restored(NamedTuple):
-    """Contents of a checkpoint."""
+    """Contents of a checkpoint, and step and score of the best one up to then."""
 
     step: int
     state: Any
     data: Any
+    best: tuple[int, float] | None = None
 
 
 def _not_of_a_failed_save(record: logging.LogRecord) -> bool:
@@ -100,8 +101,9 @@ class Checkpoints:
     ) -> None:
         if keep < 1:
             raise ValueError(f"keep is {keep}: must be at least 1; raise it")
-        self._directory, self._scored, self._print = directory.absolute(), better is not None, print_
+        self._directory, self._better, self._print = directory.absolute(), better, print_
         self._saving: int | None = None
+        self._best: tuple[int, float] | None = None
         policy = LatestN(keep)
         if better is not None:
             best = BestN(get_metric_fn=_score, reverse=better == "lower", n=1, keep_checkpoints_without_metrics=False)
@@ -115,6 +117,7 @@ class Checkpoints:
             async_options=ocp.AsyncOptions(post_finalization_callback=self._sign),
         )
         try:
+            self._set_aside_unscored()
             self._manager = ocp.CheckpointManager(self._directory, options=options)
         except _FAILURES as error:
             raise CheckpointError(
@@ -149,11 +152,13 @@ class Checkpoints:
           CheckpointError: this checkpoint does not fit on the disk, or the one before it did not reach it.
           ValueError: a score that is not finite, or one without `better`.
         """
-        if score is not None and not (self._scored and math.isfinite(score)):
+        if score is not None and not (self._better and math.isfinite(score)):
             raise ValueError(f"score is {score}: must be finite, and `better` must be set; score held-out data")
         self._require_room(state)
         state = jax.tree.map(jnp.copy, state)
-        held = {"data": data, "digests": _digests(state)}
+        if score is not None and self._is_best(score):
+            self._best = step, score
+        held = {"data": data, "digests": _digests(state)} | ({"best": self._best} if self._better else {})
         args = ocp.args.Composite(
             state=ocp.args.StandardSave(state), data=ocp.args.JsonSave(held | {"crc32": _crc32(held)})
         )
@@ -175,7 +180,8 @@ class Checkpoints:
     def restore(self, like: Any) -> Restored | None:
         """The newest intact checkpoint in the shapes, dtypes and placement of `like`, or `None` where there is none.
 
-        Damaged ones are renamed to `damaged-STEP` and reported.
+        Damaged ones are renamed to `damaged-STEP` and reported.  That the best before it is lost is reported too: it
+        matters only if no later one is as good.
 
         Raises:
           CheckpointError: it holds another tree or other shapes.
@@ -184,10 +190,15 @@ class Checkpoints:
         damaged: list[int] = []
         for step in sorted(self._manager.all_steps(), reverse=True):
             try:
-                return self._read(step, like)
+                found = self._read(step, like)
             except DamagedCheckpointError as error:
                 damaged.append(step)
                 self._print(f"{error}; it is kept as {self._set_aside(step).name}")
+                self._manager.reload()
+            else:
+                self._best = found.best
+                self._look_for_best(found.step)
+                return found
         if damaged:
             raise DamagedCheckpointError(
                 f"{self._directory}: no checkpoint is intact, {damaged} are damaged and were set aside as damaged-*; "
@@ -202,8 +213,38 @@ class Checkpoints:
           CheckpointError: it is damaged, or holds another tree or other shapes.
         """
         self._manager.wait_until_finished()
-        step = self._manager.best_step() if self._scored else None
-        return None if step is None else self._read(step, like)
+        if self._better and self._best is None:
+            self.restore(like)
+        if not self._better or self._best is None:
+            return None
+        try:
+            return self._read(self._best[0], like)
+        except DamagedCheckpointError as error:
+            raise DamagedCheckpointError(
+                f"{error}; it is the best of its stage: put a copy back, or move {self._directory} away to train this "
+                "stage from its beginning"
+            ) from error
+
+    def _is_best(self, score: float) -> bool:
+        """True if no checkpoint so far is better; of equal ones Orbax keeps the newest."""
+        if self._best is None:
+            return True
+        return score <= self._best[1] if self._better == "lower" else score >= self._best[1]
+
+    def _look_for_best(self, restored: int) -> None:
+        """Say so if the best checkpoint up to the one that was restored is not whole."""
+        if self._best is None or self._best[0] == restored:
+            return
+        where = self._directory / str(self._best[0])
+        if not where.is_dir() or changed_files(where):
+            self._print(f"{where}, the best so far, is damaged or gone: put a copy back, unless a later one is as good")
+
+    def _set_aside_unscored(self) -> None:
+        """Set checkpoints aside whose score is not what was saved, before Orbax ranks by it."""
+        for where in sorted(self._directory.glob("[0-9]*")) if self._better else ():
+            if where.name.isdigit() and changed_files(where, "metrics"):
+                name = self._set_aside(int(where.name)).name
+                self._print(f"{where}: the checksum of its score does not hold; it is kept as {name}")
 
     def _read(self, step: int, like: Any) -> Restored:
         where = self._directory / str(step)
@@ -212,7 +253,8 @@ class Checkpoints:
             raise DamagedCheckpointError(f"{where}: the checksum of {', '.join(changed)} does not hold")
         try:
             found = self._restored(step, like)
-            held = {name: found.data[name] for name in ("data", "digests")}
+            held = {name: value for name, value in found.data.items() if name != "crc32"}
+            data, digests = held["data"], held["digests"]
             intact = found.data["crc32"] == _crc32(held)
         except _FAILURES as error:
             if self._readable(step):
@@ -223,10 +265,16 @@ class Checkpoints:
             raise DamagedCheckpointError(f"{where} cannot be read ({_brief(error)})") from error
         if not intact:
             raise DamagedCheckpointError(f"{where}: the checksum of its data does not hold")
-        changed = [name for name, value in _digests(found.state).items() if held["digests"].get(name) != value]
+        changed = [name for name, value in _digests(found.state).items() if digests.get(name) != value]
         if changed:
             raise DamagedCheckpointError(f"{where}: the digest of {', '.join(changed)} does not hold")
-        return Restored(step, found.state, held["data"])
+        best = held.get("best") or self._ranked()
+        return Restored(step, found.state, data, None if best is None else (best[0], best[1]))
+
+    def _ranked(self) -> tuple[int, float] | None:
+        """The best by Orbax's scores, for checkpoints of earlier versions, which do not name it."""
+        step = self._manager.best_step() if self._better else None
+        return None if step is None else (step, _score(self._manager.metrics(step)))
 
     def _restored(self, step: int, like: Any = None) -> Any:
         args = ocp.args.Composite(state=ocp.args.StandardRestore(like), data=ocp.args.JsonRestore())
@@ -254,7 +302,6 @@ class Checkpoints:
         if jax.process_index() == 0:
             (self._directory / str(step)).rename(aside)
         multihost_utils.sync_global_devices(f"set aside {step}")
-        self._manager.reload()
         return aside
 
     def _require_room(self, state: Any) -> None:
@@ -311,20 +358,23 @@ def _digests(state: Any) -> dict[str, int]:
     return dict(zip(names, numbers.tolist(), strict=True))
 
 
-def _file_checksums(where: Path) -> dict[str, int]:
-    """CRC-32 of every file below a folder, by its path in it."""
-    files = sorted(path for path in where.rglob("*") if path.is_file() and path.name not in (CHECKSUMS, _STAMPED))
+def _file_checksums(where: Path, inside: str = "") -> dict[str, int]:
+    """CRC-32 of every file below a folder, or a folder inside of it, by its path in it."""
+    paths = (where / inside).rglob("*")
+    files = sorted(path for path in paths if path.is_file() and path.name not in (CHECKSUMS, _STAMPED))
     return {path.relative_to(where).as_posix(): zlib.crc32(path.read_bytes()) for path in files}
 
 
-def changed_files(where: Path) -> list[str]:
-    """Files of a checkpoint that are not what was saved; of one of earlier versions, which has no checksums, none."""
+def changed_files(where: Path, inside: str = "") -> list[str]:
+    """Files of a checkpoint, or of a folder inside of it, that are not what was saved; none where it has no checksums,
+    as those of earlier versions.
+    """
     path = where / CHECKSUMS
     if not path.is_file():
         return []
     try:
-        saved, found = json.loads(path.read_text()), _file_checksums(where)
-        return sorted(name for name, checksum in saved.items() if found.get(name) != checksum)
+        saved, found = json.loads(path.read_text()), _file_checksums(where, inside)
+        return sorted(name for name, x in saved.items() if name.startswith(inside) and found.get(name) != x)
     except (OSError, ValueError, AttributeError):
         return [CHECKSUMS]
 

@@ -25,6 +25,7 @@ from touchr1_jax.training.questions import ONE_AT_A_TIME
 from touchr1_jax.training.sft import SFTState
 from touchr1_jax.training.train_grpo import train_grpo
 from touchr1_jax.types import Params
+from touchr1_jax.validation import at_least, within
 
 REWARD = {"accuracy": 0.5, "exact": 0.5}  # reward of GRPO → weight
 
@@ -40,6 +41,11 @@ class TuneConfig:
     noise: float = 0.5
     """Standard deviation of the noise added to each input; the inputs have 1."""
     optimizer: OptimizerConfig = OptimizerConfig(learning_rate=1e-5, lr_scale=30.0, weight_decay=0.05)
+
+    def __post_init__(self) -> None:
+        at_least(self, 0, "steps", "noise")
+        at_least(self, 1, "batch_size")
+        within(self, 0, 0.99, "drop")
 
 
 READING = TuneConfig(

@@ -10,7 +10,8 @@ import pytest
 
 from experiments.active import active_touch
 from experiments.active.active_touch import ActiveTouchConfig
-from experiments.active.arms import Arm, check_arms
+from experiments.active.arms import Arm, LearnerConfig, check_arms
+from experiments.active.videos import StoppingConfig
 from experiments.core.errors import ConfigurationError
 from tests.touchr1_jax.explored import BANK, POLICY
 from touchr1_jax.rewards import RewardError
@@ -59,3 +60,18 @@ def test_agents_that_are_not_installed_are_refused_before_contacts_are_made(monk
         ConfigurationError, match=r"stable_baselines3 not installed; run pip install 'touchr1-jax\[agents\]'"
     ):
         active_touch.run(ActiveTouchConfig(agents=True), None)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"questions": 4}, "warm.questions is 4: must be 1"),
+        ({"pack": 64}, "warm.pack is 64: must be 0"),
+        ({"curriculum": 0.5}, r"warm.curriculum is 0\.5: must be 0"),
+        ({"conclusion_weight": 5.0}, r"warm.conclusion_weight is 5\.0: must be 1"),
+    ],
+)
+@pytest.mark.parametrize("config", [LearnerConfig, StoppingConfig])
+def test_options_that_a_warm_start_does_not_read_are_refused(config, change, said):
+    with pytest.raises(ValueError, match=said):
+        config(warm=dataclasses.replace(config().warm, **change))

@@ -109,6 +109,8 @@ def test_the_gravest_differences_come_first_and_the_others_are_counted(home, cap
     out = capsys.readouterr().out
     assert "only in A: 3; only in B: 3" in out
     assert "… and 5 more; --most shows them" in out
+    assert main(["compare", "a", "b", "--most", "-1"]) == 2
+    assert "most is -1: must be at least 0; raise it" in capsys.readouterr().err
 
 
 def test_what_cannot_be_compared_is_said(home, tmp_path, capsys):

@@ -12,6 +12,7 @@ from experiments.study.scores import PUBLISHED
 from experiments.study.seed import StudySeed
 from experiments.study.stages import ProbeFeatures, StudySFT, answer_feed, gather_evidence, make_arm
 from experiments.study.study import make_study_arm
+from experiments.study.training import TrainingConfig
 from sensors_io.schema import LEVELS
 from tests.experiments import tiny
 from touchr1_jax.models.lora import LoraConfig, by_layer
@@ -162,6 +163,21 @@ def test_devices_share_a_micro_batch():
     assert StudySFT().packing(3) is None
     with pytest.raises(ValueError, match="micro_contacts is 8: must be a multiple of the 3 devices"):
         config.packing(3)
+
+
+@pytest.mark.parametrize(
+    ("phase", "change", "said"),
+    [
+        ("decoder", {"pack": WIDTH}, "decoder.pack is 128: must be 0, for this stage does not read it"),
+        ("decoder", {"curriculum": 0.5}, r"decoder.curriculum is 0\.5: must be 0"),
+        ("decoder", {"questions": 5}, "decoder.questions is 5: must be at most 4"),
+        ("blind", {"questions": 5}, "blind.questions is 5: must be at most 4"),
+    ],
+)
+def test_options_that_a_phase_does_not_read_are_refused(phase, change, said):
+    config = TrainingConfig()
+    with pytest.raises(ValueError, match=said):
+        dataclasses.replace(config, **{phase: dataclasses.replace(getattr(config, phase), **change)})
 
 
 def test_one_word_chooses_the_stable_engine_and_the_stable_rewards(policy, data):

@@ -126,3 +126,18 @@ def test_a_changed_calibration_is_refused(real: pathlib.Path, tmp_path: pathlib.
     refused(CalibrationError, "was changed", Calibration.load, tmp_path / "changed.npz")
     (tmp_path / "text.npz").write_text("no zip")
     refused(CalibrationError, "is no calibration", Calibration.load, tmp_path / "text.npz")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"folds": 1}, "folds is 1: must be ≥ 2; raise it"),
+        ({"repeats": 0}, "repeats is 0: must be ≥ 1; raise it"),
+        ({"seed": -1}, "seed is -1: must be ≥ 0; raise it"),
+        ({"most_radius": float("nan")}, "most_radius is nan: must be ≥ 0; raise it"),
+        ({"window_mm": (40.0, 10.0)}, "window_mm is .*: must be two numbers that rise"),
+    ],
+)
+def test_requirements_that_mean_nothing_are_refused(change, said):
+    with pytest.raises(ValueError, match=said):
+        CalibrateConfig(**change)

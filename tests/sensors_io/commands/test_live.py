@@ -104,6 +104,10 @@ def run(*args):
         (["sync", "tac3d"], "two or more can be compared"),
         (["view", "uvc", "--serial", "none"], "no camera answers to it"),
         (["force-zero", "--out", "x", "--poses", "3", "netft"], "poses is 3: must be ≥ 4"),
+        (["force-zero", "--out", ".", "netft"], "is a folder: must be a file; name one in it"),
+        (["sync", "--out", ".", "tac3d", "+", "netft"], "is a folder: must be a file; name one in it"),
+        (["sync", "--out", "x", "--check", "y", "tac3d", "+", "netft"], "check y: --check writes no file; leave one"),
+        (["sync", "--check", "none.json", "tac3d", "+", "netft"], "none.json"),
     ],
 )
 def test_benches_that_make_no_sense_are_one_line(args, message, capsys, monkeypatch, tmp_path):

@@ -1,10 +1,16 @@
 """`snap` on a replayed camera: rest picture, guided presses, and a calibration from nothing else."""
 
+import pathlib
+
 import numpy as np
 import pytest
 
-from sensors_io.calibration.guide import GuideConfig, PressGuide
+from sensors_io.calibration.guide import Guidance, GuideConfig, PressGuide
 from sensors_io.calibration.presses import BallPresses
+from sensors_io.commands.snap import Snap
+from sensors_io.devices.replay import ReplayConfig
+from sensors_io.fields.sources import read_picture
+from sensors_io.fields.types import CalibrationError
 from tests.sensors_io.calibration.synthetic import press_ball, spread_touches
 
 TOUCHES = spread_touches(10)
@@ -46,3 +52,43 @@ def test_a_moving_or_shallow_or_saturated_contact_is_not_taken(presses: BallPres
     brighter = lambda picture: np.minimum(picture * 2.1, 255).astype(np.uint8)
     guide = PressGuide(presses.radius_mm, presses.mm_per_px, QUICK, brighter(presses.background))
     assert "saturated" in guide.look(brighter(presses.pictures[0])).prompt
+
+
+class Taking(PressGuide):
+    """A guide that takes every frame for a press."""
+
+    def look(self, frame: np.ndarray) -> Guidance:
+        self.touches.append(np.zeros(3))
+        return Guidance(prompt="", taken=frame)
+
+
+def resumed(folder: pathlib.Path, presses: BallPresses, guide: type[PressGuide] = Taking) -> tuple[Snap, PressGuide]:
+    """A session that goes on in a folder with a rest picture and presses 1 and 3, for 2 was bad and was removed."""
+    snap = Snap(device=ReplayConfig(path=folder), out=folder, ball_diameter_mm=2 * presses.radius_mm)
+    begun = guide(presses.radius_mm, presses.mm_per_px, QUICK, presses.background)
+    for picture in presses.pictures[:3]:
+        snap._see(begun, picture)
+    (folder / "presses" / "press_002.png").unlink()
+    again = guide(presses.radius_mm, presses.mm_per_px, QUICK, presses.background)
+    again.touches = [np.zeros(3)] * 2
+    return snap, again
+
+
+def test_a_session_that_goes_on_overwrites_no_press(tmp_path: pathlib.Path, presses: BallPresses) -> None:
+    snap, guide = resumed(tmp_path, presses)
+    snap._see(guide, presses.pictures[5])
+    kept = {path.name: read_picture(path) for path in (tmp_path / "presses").iterdir()}
+    assert sorted(kept) == ["press_001.png", "press_003.png", "press_004.png"]
+    np.testing.assert_array_equal(kept["press_003.png"], presses.pictures[2])
+    np.testing.assert_array_equal(kept["press_004.png"], presses.pictures[5])
+
+
+def test_pictures_of_another_size_are_named(tmp_path: pathlib.Path, presses: BallPresses) -> None:
+    snap, guide = resumed(tmp_path, presses)
+    with pytest.raises(CalibrationError, match=r"the camera's picture is .*background.png .*: must be equal; give the"):
+        snap._see(guide, presses.pictures[0][:-1])
+
+
+def test_a_share_beyond_one_is_never_covered() -> None:
+    with pytest.raises(ValueError, match=r"cover is 1\.1: must be ≤ 1"):
+        GuideConfig(cover=1.1)

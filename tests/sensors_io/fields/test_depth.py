@@ -158,3 +158,10 @@ def test_thresholds_in_the_wrong_order_are_refused() -> None:
 @pytest.mark.parametrize("value", [0.0, float("nan")])
 def test_criteria_of_contact_are_positive(field: str, value: float) -> None:
     refused(ValueError, f"{field} is {value}: must be > 0", lambda: ContactConfig(**{field: value}))
+
+
+@pytest.mark.parametrize("change", [{"sinks_mm": 0.0}, {"near_mm": -1.0}, {"bent": float("nan")}])
+def test_settings_of_the_zero_that_mean_nothing_are_refused(change):
+    (name,) = change
+    with pytest.raises(ValueError, match=f"{name} is .*: must be ≥ 0"):
+        ZeroConfig(**change)

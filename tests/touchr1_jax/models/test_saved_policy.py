@@ -12,7 +12,7 @@ import pytest
 from experiments.faults.trainings.small_study import MODEL
 from tests.touchr1_jax.drawn import draw_params
 from touchr1_jax.asking import load_policy
-from touchr1_jax.models.saved_policy import PolicyError, PolicyInput, SavedPolicy, read_policy, save_policy
+from touchr1_jax.models.saved_policy import PolicyError, PolicyInput, SavedPolicy, published, read_policy, save_policy
 from touchr1_jax.models.touch_policy import build_policy, touch_shapes
 from touchr1_jax.text.tokenizer import word_tokenizer
 
@@ -87,6 +87,25 @@ def test_a_policy_is_replaced_and_nothing_else_is(saved, folder):
     with pytest.raises(PolicyError, match="exists and is no policy"):
         save_policy(folder.parent / "thesis", saved)
     assert (folder.parent / "thesis" / "text").read_text() == "x"
+
+
+@pytest.mark.parametrize("name", [".git", "notes.txt"])
+def test_what_lies_beside_a_policy_is_not_lost_with_it(saved, folder, name):
+    """A clone of a repository of the hub, for example."""
+    (folder / name).mkdir()
+    before = read_policy(folder).notes
+    with pytest.raises(PolicyError, match=f"it also holds {name}, which would be lost; move it away, or choose"):
+        save_policy(folder, dataclasses.replace(saved, notes={"name": "second"}))
+    assert (folder / name).is_dir()
+    assert read_policy(folder).notes == before
+
+
+def test_a_folder_of_other_parts_or_a_file_is_not_replaced(tmp_path):
+    (tmp_path / "text").write_text("x")
+    for path, said in ((tmp_path, "it also holds text"), (tmp_path / "text", "a file; move it away")):
+        with pytest.raises(PolicyError, match=said), published(path, ("config.json",)):
+            pass
+    assert (tmp_path / "text").read_text() == "x"
 
 
 def edit(folder, **changes):

@@ -180,6 +180,7 @@ WRONG = {
     "length": (STEP, BUDGET + 1),
     "constrained": (dataclasses.replace(STEP, algorithm=Paper()), BUDGET),
     "tactile_use": (dataclasses.replace(STEP, algorithm=Stable(constrained=True)), BUDGET),
+    "stable_rewards": (dataclasses.replace(STEP, algorithm=Paper(constrained=True, stable_rewards=True)), BUDGET),
     "segment_credit": (dataclasses.replace(STEP, algorithm=Paper(constrained=True, segment_credit=True)), BUDGET),
     "buckets": (dataclasses.replace(STEP, buckets=(5,)), BUDGET),
 }

@@ -84,6 +84,9 @@ def test_a_group_of_one_has_nothing_to_be_compared_with():
         ({"reference_every": 0}, "reference_every is 0: must be at least 1"),
         ({"beta": -0.1}, "beta is -0.1: must be ≥ 0"),
         ({"gamma": float("nan")}, "gamma is nan: must be ≥ 0"),
+        ({"epsilon": float("inf")}, "epsilon is inf: must be ≥ 0 and finite"),
+        ({"tactile_margin": -0.1}, "tactile_margin is -0.1: must be ≥ 0"),
+        ({"tactile_margin": float("nan")}, "tactile_margin is nan: must be ≥ 0"),
         ({"grounding_cap_nat": 0.0}, "grounding_cap_nat is 0.0: must be above 0; None leaves it out"),
     ],
 )

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +24,7 @@ from touchr1_jax.rl.enumerated import (
     exact_terms,
     level_rewards,
 )
-from touchr1_jax.rl.grpo import make_grpo_step, start_state
+from touchr1_jax.rl.grpo import Group, GRPOEngine, make_grpo_step, start_state
 from touchr1_jax.rl.losses import TokenTerms, grpo_loss
 from touchr1_jax.rl.scoring import make_score
 from touchr1_jax.text.constraint import compile_constraint
@@ -174,7 +175,7 @@ def rewards():
     reward_of = lambda tokens, level: each(tokens, target)[0]
     both = jnp.stack([tokens, tokens])
     sampled, counts = jnp.full((2, 2), 0.25), jnp.ones(2, bool)
-    return jax.jit(lambda both: level_rewards(reward_of, LEVELS, both, target, sampled, counts))(both)
+    return jax.jit(lambda both: level_rewards(reward_of, LEVELS, both, target, sampled, counts))(both)[0]
 
 
 @pytest.mark.long
@@ -186,6 +187,36 @@ def test_rewards_of_every_conclusion_by_hand(rewards):
     assert rewards.at[0, 1] == length
     np.testing.assert_array_equal(rewards.at[1], [length, length])  # a question about everything is not enumerated
     assert list(rewards.ids[0]) == list(LEVELS.level[0])
+
+
+def test_a_level_that_nobody_said_and_whose_reward_is_nan_costs_its_group():
+    """Two questions; every answer says the first level.  For the second question another level earns NaN."""
+    opens, first = LEVELS.opens, int(LEVELS.level[0][0])
+    tokens = jnp.broadcast_to(jnp.array([opens, first]), (2, 2, 2))
+    target = tiny.target(np.zeros(2, int), np.array([2, 2]))
+    broken = lambda tokens, level: jnp.where((level == 1) & (jnp.arange(2) == 1)[:, None], jnp.nan, jnp.ones((2, 2)))
+    sampled, counts = jnp.ones((2, 2)), jnp.ones(2, bool)
+    found, finite = level_rewards(broken, LEVELS, tokens, target, sampled, counts)
+    np.testing.assert_array_equal(finite, [True, False])
+    np.testing.assert_allclose(found.reward[0, 0, :3], 1)
+    np.testing.assert_allclose(found.reward[1], 0)
+
+
+@pytest.mark.long
+def test_a_group_that_is_left_out_teaches_its_traces_nothing():
+    """Some answers conclude and some do not: the first have expected reward 0, the others the mean of other groups."""
+    config = GRPOConfig(prompts=P, micro_prompts=P, group=3, length=4, algorithm=Rloo(enumerated=Norm.NONE))
+    engine = GRPOEngine(FNS, score, optax.sgd(0.1), config, None, lambda p: p, LEVELS, False)
+    batch = tiny.question_batch(1, P)
+    finite = jnp.arange(P) > 0
+    nothing = jnp.zeros((P, 3))
+    at = jnp.ones((P, 3), int)
+    levels = LevelRewards(ids=jnp.zeros((P, 1), int), at=at, reward=nothing[..., None], sampled=nothing)
+    rollout = SimpleNamespace(mask=jnp.ones((P, 3, 4), bool), log_prob=jnp.zeros((P, 3, 4)))
+    parsed = SimpleNamespace(truncated=jnp.zeros((P, 3), bool))
+    group = Group(batch, rollout, parsed, nothing, {}, finite, nothing, levels)
+    weight = engine.experience(group, (batch.features.touch, jnp.zeros(P, int))).weight
+    np.testing.assert_allclose(weight, np.where(finite, 1 / P, 0))
 
 
 def test_prompts_whose_levels_all_earn_the_same_teach_nothing():

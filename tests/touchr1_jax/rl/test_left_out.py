@@ -109,6 +109,14 @@ def test_a_sum_that_overflows_is_named_too():
     assert (shares["nonfinite_in_a"], shares["nonfinite_in_total"]) == (0, 1)
 
 
+def test_rewards_whose_spread_overflows_are_named_too():
+    """Their σ is infinite, so that every advantage would be 0 without a word."""
+    big = jnp.array([[1e25, 0.0], [1.0, 0.0]])
+    _, _, finite, shares = left_out_groups(big, {"a": big})
+    np.testing.assert_array_equal(finite, [False, True])
+    assert (shares["nonfinite_in_a"], shares["nonfinite_in_total"]) == (0, 0.5)
+
+
 PARAMS = {"w": jnp.arange(3.0)}
 
 

@@ -26,7 +26,7 @@ from touchr1_jax.rl.config import (
     left_out,
 )
 from touchr1_jax.rl.grpo import make_grpo_step, start_state
-from touchr1_jax.rl.scoring import make_score
+from touchr1_jax.rl.scoring import make_score, reward_weights
 from touchr1_jax.text.parser import compile_parser
 
 G, T = 3, 6
@@ -226,6 +226,16 @@ def test_only_the_number_zero_leaves_a_term_out():
 def test_constrained_sampling_needs_a_constraint():
     with pytest.raises(ValueError, match="constrained is True, but there is no constraint"):
         make_grpo_step(FNS, score, OPTIMIZER, of(Paper(constrained=True)))
+
+
+def test_the_stable_preset_takes_no_published_reward():
+    """Answers without touch outwit them; `reward_weights` takes their stable forms."""
+    rewards, parser = make_rewards(uniform_prior((3, 3, 3, 9))), compile_parser(tiny.LANGUAGE, tiny.TOKENIZER)
+    published = {"accuracy": 0.9, "format": 0.1}
+    with pytest.raises(ValueError, match="stable_rewards is True, but the score weighs accuracy, format: must"):
+        make_grpo_step(FNS, make_score(parser, rewards, published), OPTIMIZER, of(Stable()))
+    stable = make_score(parser, rewards, reward_weights(Stable(), published))
+    make_grpo_step(FNS, stable, OPTIMIZER, of(Stable()))
 
 
 def test_a_score_that_knows_no_rewards_cannot_credit_segments():

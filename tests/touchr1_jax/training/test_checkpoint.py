@@ -204,6 +204,80 @@ class TestBest:
             checkpoints.save(1, {"x": jnp.zeros(2)}, None, score)
 
 
+LIKE = {"x": jnp.zeros(2)}
+
+
+class TestDamagedBest:
+    """Scores 3, 5, 4: checkpoint 2 is the best, 3 the newest."""
+
+    @pytest.fixture
+    def stage(self, tmp_path):
+        with Checkpoints(tmp_path, keep=1, better="higher") as checkpoints:
+            self.save(checkpoints, 3.0, 5.0, 4.0)
+        return tmp_path
+
+    def save(self, checkpoints, *scores):
+        for n, score in enumerate(scores, 1):
+            checkpoints.save(n, {"x": jnp.full(2, n, jnp.float32)}, n, score)
+
+    @pytest.mark.parametrize(
+        "text", ['{"score": 1.0}', '{"score": NaN}', '{"score": "5"}', "{}", "[1]", "{garbage", None]
+    )
+    def test_another_is_not_taken_for_it(self, stage, text):
+        """Orbax reads scores before any checksum is compared, and leaves checkpoints without one out."""
+        path = stage / "2" / "metrics" / "metrics"
+        path.unlink() if text is None else path.write_text(text)
+        told = []
+        wanted = pytest.raises(DamagedCheckpointError, match=r"best of its stage: put a copy back, or move .* away")
+        with Checkpoints(stage, better="higher", print_=told.append) as checkpoints, wanted:
+            assert checkpoints.restore(LIKE).step == 3
+            checkpoints.best(LIKE)
+        assert "2: the checksum of its score does not hold; it is kept as damaged-2" in told[0]
+        assert "2, the best so far, is damaged or gone: put a copy back, unless a later one is as good" in told[1]
+
+    @pytest.mark.parametrize("score", [4.5, 5.0])
+    def test_without_it_a_later_one_must_be_as_good(self, stage, score):
+        shutil.rmtree(stage / "2")
+        with Checkpoints(stage, better="higher", print_=lambda text: None) as checkpoints:
+            checkpoints.restore(LIKE)
+            checkpoints.save(4, LIKE, 4, score)
+            if score == 5.0:
+                assert checkpoints.best(LIKE).step == 4
+            else:
+                with pytest.raises(DamagedCheckpointError, match="best of its stage"):
+                    checkpoints.best(LIKE)
+
+    def test_a_damaged_one_says_what_to_do(self, stage):
+        with Checkpoints(stage, better="higher", print_=lambda text: None) as checkpoints:
+            checkpoints.restore(LIKE)
+            shutil.rmtree(stage / "2" / "data")
+            with pytest.raises(DamagedCheckpointError, match=r"best of its stage: put a copy back, or move .* away"):
+                checkpoints.best(LIKE)
+
+    def test_the_score_of_another_than_the_best_costs_that_one_alone(self, stage):
+        (stage / "3" / "metrics" / "metrics").write_text("{garbage")
+        with Checkpoints(stage, better="higher", print_=lambda text: None) as checkpoints:
+            assert checkpoints.restore(LIKE).step == 2
+            assert checkpoints.best(LIKE).step == 2
+
+    @pytest.mark.parametrize(("better", "best"), [("higher", 3), ("lower", 4)])
+    def test_of_equal_ones_the_newest_is_the_best_however_often_the_run_is_resumed(self, tmp_path, better, best):
+        for n, score in enumerate((4.0, 5.0, 5.0, 4.0, 4.5), 1):
+            with Checkpoints(tmp_path, keep=1, better=better) as checkpoints:
+                checkpoints.restore(LIKE)
+                checkpoints.save(n, LIKE, n, score)
+        with Checkpoints(tmp_path, better=better) as checkpoints:
+            assert checkpoints.best(LIKE).step == best
+
+    def test_checkpoints_that_do_not_name_the_best_are_ranked_by_their_scores(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(Checkpoints, "_is_best", lambda self, score: False)
+        with Checkpoints(tmp_path, keep=1, better="higher") as checkpoints:
+            self.save(checkpoints, 3.0, 5.0, 4.0)
+        monkeypatch.undo()
+        with Checkpoints(tmp_path, better="higher") as checkpoints:
+            assert checkpoints.best(LIKE).step == 2
+
+
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16, jnp.int32, jnp.uint8, jnp.bool_])
 def test_a_digest_tells_every_element_and_its_place(dtype):
     x = np.arange(24).reshape(2, 3, 4) % 2

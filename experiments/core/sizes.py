@@ -1,0 +1,56 @@
+"""Numbers of a configuration that can mean nothing, by those that all scales of its experiment have."""
+
+import dataclasses
+from collections.abc import Collection, Iterator
+from typing import Any
+
+
+def require_sizes(config: Any, scales: Collection[Any]) -> None:
+    """Refuse what no scale has: numbers below 0 where none is, and no steps, seeds or rounds where all have some.
+
+    What a class checks by itself is left to it, and a seed may be 0.
+
+    Args:
+      config: of a command.
+      scales: configurations of the experiment, of the same class.
+
+    Raises:
+      ValueError: naming the field, its value and the bound.
+    """
+    usual = [dict(_leaves(scale)) for scale in scales]
+    for path, (value, owner) in _leaves(config).items():
+        others = [scale[path][0] for scale in usual if path in scale]
+        numbers = [x for x in _several(value) if _is_number(x)]
+        least = min((x for other in others for x in _several(other) if _is_number(x)), default=None)
+        if least is not None and least >= 0 and any(x < 0 for x in numbers):
+            raise ValueError(f"{path} is {value}: must be at least 0; raise it")
+        counts = isinstance(value, int) and least is not None and least >= 1 and not path.endswith("seed")
+        if counts and value < 1 and _takes(owner, path, -1):
+            raise ValueError(f"{path} is {value}: must be at least 1; raise it")
+
+
+def _leaves(config: Any, prefix: str = "") -> dict[str, tuple[Any, Any]]:
+    """Dotted name → value and the dataclass that holds it."""
+    found: dict[str, tuple[Any, Any]] = {}
+    for field in dataclasses.fields(config):
+        value, path = getattr(config, field.name), f"{prefix}{field.name}"
+        held = dataclasses.is_dataclass(value)
+        found |= _leaves(value, f"{path}.") if held else {path: (value, config)}
+    return found
+
+
+def _several(value: Any) -> Iterator[Any]:
+    yield from value if isinstance(value, tuple) else (value,)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _takes(owner: Any, path: str, value: Any) -> bool:
+    """True if a class accepts a value that is never one: then it does not check the field."""
+    try:
+        dataclasses.replace(owner, **{path.rpartition(".")[2]: value})
+    except (ValueError, TypeError):
+        return False
+    return True

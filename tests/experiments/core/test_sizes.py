@@ -1,0 +1,59 @@
+"""Numbers of a configuration that no scale has."""
+
+import dataclasses
+
+import pytest
+
+from experiments.core.sizes import require_sizes
+from touchr1_jax.validation import at_least
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Training:
+    steps: int = 100
+    rate: float = 0.1
+    forces: tuple[float, ...] = (1.0, 5.0)
+    shift: float = 0.0
+    first_seed: int = 3
+    kept: bool = True
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Checked:
+    steps: int = 10
+
+    def __post_init__(self) -> None:
+        at_least(self, 0, "steps")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Config:
+    training: Training = Training()
+    checked: Checked = Checked()
+    moments: int = 4
+    name: str = "a"
+    most: int | None = None
+
+
+SCALES = (Config(), Config(training=Training(shift=-1.0), moments=0))
+"""One of them moves backwards, and has no moments."""
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"steps": -1}, "training.steps is -1: must be at least 0; raise it"),
+        ({"steps": 0}, "training.steps is 0: must be at least 1; raise it"),
+        ({"rate": -0.1}, "training.rate is -0.1: must be at least 0; raise it"),
+        ({"forces": (1.0, -5.0)}, r"training.forces is \(1.0, -5.0\): must be at least 0; raise it"),
+        ({"first_seed": -1}, "training.first_seed is -1: must be at least 0; raise it"),
+    ],
+)
+def test_what_no_scale_has_is_refused(change, said):
+    with pytest.raises(ValueError, match=said):
+        require_sizes(Config(training=Training(**change)), SCALES)
+
+
+def test_what_a_scale_has_or_a_class_checks_itself_is_taken():
+    training = Training(shift=-3.0, first_seed=0, rate=0.0, forces=(0.0,), kept=False)
+    require_sizes(Config(training=training, checked=Checked(steps=0), moments=0, most=-1), SCALES)
