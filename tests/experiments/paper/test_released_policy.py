@@ -91,7 +91,7 @@ def folder(saved, weights, tmp_path_factory):
     """Written in place of an older one."""
     folder = tmp_path_factory.mktemp("run") / "policies" / "0"
     folder.mkdir(parents=True)
-    (folder / "left.json").write_text("{}")
+    (folder / "config.json").write_text("{}")
     save_adapted(folder, saved, str(weights))
     return folder
 
