@@ -32,7 +32,7 @@ demo: setup  ## ask a trained policy in the browser: ARGS="POLICY", that of the 
 test: setup  ## pass the tests (five minutes on two cores)
 	$(PYTEST) -m 'not long and not slow' $(ARGS)
 
-test-long: setup  ## pass the tests that train or compile for seconds (ten minutes)
+test-long: setup  ## pass the tests that train or compile for seconds (twenty minutes)
 	$(PYTEST) -m 'long and not slow' $(ARGS)
 
 test-slow: setup  ## pass the tests that take minutes

@@ -50,6 +50,11 @@ TOUCHES = Paper(beta=0.02, kl="exact", gamma=0.0, constrained=True, enumerated=N
 """Learns touches alone, from the probability of the right answer; the answers stay those of the warm start."""
 
 
+def check_warm_start(config: SFTConfig) -> None:
+    """Refuse settings of SFT that a warm start on random touches does not read; `ValueError` names them."""
+    unused(config, "warm", questions=1, pack=0, curriculum=0.0, conclusion_weight=1.0)
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Arm:
     """A reinforced policy: most contacts, price of a second and of harm in units of a right answer."""
@@ -104,7 +109,7 @@ class LearnerConfig:
     thresholds: tuple[float, ...] = (0.5, 0.6, 0.7, 0.8, 0.9)
 
     def __post_init__(self) -> None:
-        unused(self.warm, "warm", questions=1, pack=0, curriculum=0.0, conclusion_weight=1.0)
+        check_warm_start(self.warm)
         for name in ("dropout", "several_dropout"):
             if not 0 <= getattr(self, name) < 1:
                 raise ConfigurationError(f"{name} is {getattr(self, name)}: must lie in 0 ≤ {name} < 1; lower it")

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from experiments.active.arms import TOUCHES, as_json, from_json
+from experiments.active.arms import TOUCHES, as_json, check_warm_start, from_json
 from experiments.active.encoder import belief_scale, belief_tokens
 from experiments.active.plans import Answer, Played, play, same_for_all, until_sure
 from experiments.active.policies import answerer, explore, part_of, reinforce, warm_up
@@ -37,7 +37,6 @@ from touchr1_jax.training.exploration import NO_CHOICE
 from touchr1_jax.training.kernel_probe import KernelProbeConfig, cross_probe, object_weights
 from touchr1_jax.training.optimizer import OptimizerConfig
 from touchr1_jax.training.train_sft import SFTConfig
-from touchr1_jax.validation import unused
 
 CHOSEN = "chosen"
 RESAMPLES = 2000
@@ -94,7 +93,7 @@ class StoppingConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        unused(self.warm, "warm", questions=1, pack=0, curriculum=0.0, conclusion_weight=1.0)
+        check_warm_start(self.warm)
         if self.videos < 2 or self.folds < 2 or not 0 < self.warm_share < 1:
             raise ConfigurationError(
                 f"videos, folds, warm_share are {self.videos}, {self.folds}, {self.warm_share}: must be at least 2, "

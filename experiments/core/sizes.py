@@ -17,7 +17,7 @@ def require_sizes(config: Any, scales: Collection[Any]) -> None:
     Raises:
       ValueError: naming the field, its value and the bound.
     """
-    usual = [dict(_leaves(scale)) for scale in scales]
+    usual = [_leaves(scale) for scale in scales]
     for path, (value, owner) in _leaves(config).items():
         others = [scale[path][0] for scale in usual if path in scale]
         numbers = [x for x in _several(value) if _is_number(x)]
@@ -25,7 +25,7 @@ def require_sizes(config: Any, scales: Collection[Any]) -> None:
         if least is not None and least >= 0 and any(x < 0 for x in numbers):
             raise ValueError(f"{path} is {value}: must be at least 0; raise it")
         counts = isinstance(value, int) and least is not None and least >= 1 and not path.endswith("seed")
-        if counts and value < 1 and _takes(owner, path, -1):
+        if counts and value < 1 and _is_unchecked(owner, path):
             raise ValueError(f"{path} is {value}: must be at least 1; raise it")
 
 
@@ -34,8 +34,7 @@ def _leaves(config: Any, prefix: str = "") -> dict[str, tuple[Any, Any]]:
     found: dict[str, tuple[Any, Any]] = {}
     for field in dataclasses.fields(config):
         value, path = getattr(config, field.name), f"{prefix}{field.name}"
-        held = dataclasses.is_dataclass(value)
-        found |= _leaves(value, f"{path}.") if held else {path: (value, config)}
+        found |= _leaves(value, f"{path}.") if dataclasses.is_dataclass(value) else {path: (value, config)}
     return found
 
 
@@ -47,10 +46,10 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _takes(owner: Any, path: str, value: Any) -> bool:
-    """True if a class accepts a value that is never one: then it does not check the field."""
+def _is_unchecked(owner: Any, path: str) -> bool:
+    """True if a class accepts −1, which is no count: then it does not check the field."""
     try:
-        dataclasses.replace(owner, **{path.rpartition(".")[2]: value})
+        dataclasses.replace(owner, **{path.rpartition(".")[2]: -1})
     except (ValueError, TypeError):
         return False
     return True

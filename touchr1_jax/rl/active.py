@@ -26,7 +26,7 @@ from touchr1_jax.rl.gradient import Experience
 from touchr1_jax.rl.grpo import Group, GRPOEngine, GRPOState, compile_step
 from touchr1_jax.rl.metrics import advantage_metrics
 from touchr1_jax.rl.rollout import SampleConfig
-from touchr1_jax.rl.scoring import NONFINITE_IN, left_out_groups
+from touchr1_jax.rl.scoring import left_out_groups
 from touchr1_jax.rl.touch_reward import Prices, Spent, TouchReward, priced_answer
 from touchr1_jax.rl.trajectory import ActiveBatch, Trajectories, sample_trajectories
 from touchr1_jax.types import Params
@@ -142,8 +142,9 @@ class ActiveEngine(GRPOEngine):
         reward, terms, finite, left_out = left_out_groups(reward, terms)
         levels = None
         if self.config.algorithm.enumerated is not None and self.levels is not None:
-            levels, known = level_rewards(with_answer, self.levels, found.rollout.tokens, batch.target, reward, finite)
-            finite, left_out = known, {**left_out, f"{NONFINITE_IN}levels": jnp.mean(finite & ~known)}
+            of = with_answer, self.levels, found.rollout.tokens, batch.target, reward, finite
+            levels, finite, more = level_rewards(*of)
+            left_out |= more
         seen = Explored(batch.features, found.touch, found.exists, jnp.any(found.exists, (1, 2, 3))[:, None])
         shown: dict[str, Any] = {"features": seen}
         group = Group(

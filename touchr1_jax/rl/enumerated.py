@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.rl.config import Norm
+from touchr1_jax.rl.scoring import NONFINITE_IN
 from touchr1_jax.text.template import LevelTokens
 from touchr1_jax.types import Target
 
@@ -59,7 +60,7 @@ def level_rewards(
     target: Target,
     sampled: Float[Array, "P G"],
     finite: Bool[Array, "P"],
-) -> tuple[LevelRewards, Bool[Array, "P"]]:
+) -> tuple[LevelRewards, Bool[Array, "P"], dict[str, Float[Array, ""]]]:
     """Rewards of all completions with each level in turn as their conclusion; tokens after it stay as sampled.
 
     Args:
@@ -71,8 +72,8 @@ def level_rewards(
       finite: prompts whose group counts; the rewards of others are 0.
 
     Returns:
-      The rewards; and which prompts count: of those in `finite` the ones that earn a finite reward with every level,
-      also with those that no rollout said.
+      The rewards; which prompts count: of those in `finite` the ones that earn a finite reward with every level, also
+      with those that no rollout said; and by `nonfinite_in_levels` the share of the others in all prompts.
     """
     length = tokens.shape[-1]
     ids = jnp.asarray(levels.level, jnp.int32)[jnp.argmax(target.asked, -1)]  # P K
@@ -86,9 +87,9 @@ def level_rewards(
         return jnp.where((finite & (word >= 0))[:, None], reward, 0.0)
 
     reward = jnp.moveaxis(jax.lax.map(with_level, (jnp.arange(ids.shape[1]), ids.T)), 0, -1)
-    finite &= jnp.all(jnp.isfinite(reward), (-2, -1))
-    reward = jnp.where(finite[:, None, None], reward, 0.0)
-    return LevelRewards(ids=ids, at=at, reward=reward, sampled=sampled), finite
+    known = finite & jnp.all(jnp.isfinite(reward), (-2, -1))
+    found = LevelRewards(ids=ids, at=at, reward=jnp.where(known[:, None, None], reward, 0.0), sampled=sampled)
+    return found, known, {f"{NONFINITE_IN}levels": jnp.mean(finite & ~known)}
 
 
 def conclusion_place(tokens: Int[Array, "*n T"], opens: int) -> Int[Array, "*n"]:

@@ -49,7 +49,6 @@ from touchr1_jax.rl.metrics import (
 )
 from touchr1_jax.rl.rollout import GRPOBatch, SampleConfig, encode_prompts, sample_prompts
 from touchr1_jax.rl.scoring import (
-    NONFINITE_IN,
     ScoreFn,
     WeightedScore,
     left_out_groups,
@@ -258,8 +257,8 @@ class GRPOEngine:
         levels = None
         if algorithm.enumerated is not None and self.levels is not None:
             reward_of = lambda tokens, level: score(tokens, batch.target)[0]
-            levels, known = level_rewards(reward_of, self.levels, rollout.tokens, batch.target, reward, finite)
-            finite, left_out = known, {**left_out, f"{NONFINITE_IN}levels": jnp.mean(finite & ~known)}
+            levels, finite, more = level_rewards(reward_of, self.levels, rollout.tokens, batch.target, reward, finite)
+            left_out |= more
         return Group(batch, rollout, parsed, reward, terms, finite, bonus, levels), metrics | left_out
 
     def draw(self, group: int) -> SampleConfig:

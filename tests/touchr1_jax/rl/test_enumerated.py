@@ -196,8 +196,9 @@ def test_a_level_that_nobody_said_and_whose_reward_is_nan_costs_its_group():
     target = tiny.target(np.zeros(2, int), np.array([2, 2]))
     broken = lambda tokens, level: jnp.where((level == 1) & (jnp.arange(2) == 1)[:, None], jnp.nan, jnp.ones((2, 2)))
     sampled, counts = jnp.ones((2, 2)), jnp.ones(2, bool)
-    found, finite = level_rewards(broken, LEVELS, tokens, target, sampled, counts)
+    found, finite, shares = level_rewards(broken, LEVELS, tokens, target, sampled, counts)
     np.testing.assert_array_equal(finite, [True, False])
+    assert shares == {"nonfinite_in_levels": 0.5}
     np.testing.assert_allclose(found.reward[0, 0, :3], 1)
     np.testing.assert_allclose(found.reward[1], 0)
 

@@ -73,18 +73,14 @@ def test_the_literal_bonus_of_a_group_that_is_left_out_is_the_mean_of_the_others
     config = dataclasses.replace(CONFIG, algorithm=Paper(gamma=0.0, tactile_use=TactileUse.LITERAL))
     batch = tiny.question_batch(1, P)
     label = jnp.where(batch.target.asked[:, :1], BROKEN, batch.target.label)
-    batch = batch.replace(target=batch.target.replace(label=label), rollout=Rollout(*drawn()))
+    tokens = tiny.completions(0, P, 3, 4)
+    rollout = Rollout(tokens, jnp.zeros(tokens.shape), jnp.ones(tokens.shape, bool))
+    batch = batch.replace(target=batch.target.replace(label=label), rollout=rollout)
     engine = GRPOEngine(FNS, worth, OPTIMIZER, config, None, lambda params: params, None, False)
     group, _ = jax.jit(engine.rollouts)(tiny.shallow_params(0), batch, FROZEN, jax.random.key(0), jax.random.key(1))
     left_out = ~np.asarray(group.finite)
     assert left_out.any()
     np.testing.assert_allclose(group.reward[left_out], jnp.mean(group.reward[~left_out]), rtol=1e-6)
-
-
-def drawn():
-    """Tokens of every prompt's group, their log-probabilities and their mask."""
-    tokens = tiny.completions(0, P, 3, 4)
-    return tokens, jnp.zeros(tokens.shape), jnp.ones(tokens.shape, bool)
 
 
 @pytest.mark.long
