@@ -3,11 +3,12 @@
     make experiment EXP=few_labels
 
 Policies are trained with 10, 30, 100, 300 and all labelled contacts, from a random encoder and from one that stage 1
-has pretrained on the touch of all training objects: by SFT end to end (`sft`), or in two phases, of the encoders by a
-linear head and of the decoder (`two_phases`).  From there, GRPO trains on the labelled contacts (`grpo`); GRPO also
-asks about unlabelled contacts and rewards the level on which most single sensors agree (`agreement`); or GRPO rewards
-the level that measured physics implies (`physics`): hardness from the slope of force over indentation, roughness from
-friction force over load where a contact slides.  All policies are scored once on test objects.
+has pretrained on the touch of all training objects (contrast between the sensors of a contact): by SFT end to end
+(`sft`), or in two phases, of the encoders by a linear head and of the decoder (`two_phases`).  From there, GRPO trains
+on the labelled contacts (`grpo`); GRPO also asks about unlabelled contacts and rewards the level on which most single
+sensors agree (`agreement`); or GRPO rewards the level that measured physics implies (`physics`): hardness from the slope
+of force over indentation, roughness from friction force over load where a contact slides.  All policies are scored once
+on test objects.
 
 Cost: about half an hour on two cores; `--scale smoke` under two minutes.
 
@@ -47,13 +48,13 @@ from experiments.study.stages import (
     noise_bank,
     probe_features,
 )
+from experiments.study.study import MODEL, Study, StudyConfig, open_study_data
 from experiments.study.study import SMOKE as SMOKE_STUDY
-from experiments.study.study import Study, StudyConfig, open_study_data
 from experiments.study.training import DECODER, starting_model
 from sensors_io.schema import SENSORS
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.tactile_vit import TactileViTConfig
-from touchr1_jax.models.touch_policy import TouchPolicy, build_policy, check_model, with_lora
+from touchr1_jax.models.touch_policy import ModelConfig, TouchPolicy, build_policy, check_model, with_lora
 from touchr1_jax.rewards import uniform_prior
 from touchr1_jax.rl.config import GRPOConfig, Norm, Rloo
 from touchr1_jax.training.evaluation import Evaluation, evaluate_policy
@@ -72,6 +73,9 @@ METHODS: tuple[Method, ...] = ("sft", "two_phases", "grpo", "agreement", "physic
 
 RANDOM, PRETRAINED = "random", "pretrained"  # encoders that SFT starts from
 
+SIDE_PX = 56
+"""Side of the tactile pictures: a stem of 2 px makes as many tokens of them as one of 4 of 112, for a quarter."""
+
 COMPARED = ("acc", "omae", "mat_acc")
 
 
@@ -80,6 +84,8 @@ class FewLabelsConfig(StudyConfig):
     """A study for each number of labels and each encoder."""
 
     seeds: int = 3
+    model: ModelConfig = dataclasses.replace(MODEL, image_px=SIDE_PX)
+    """Sizes; the shape of the tactile encoder is that of stage 1, also where it starts from random parameters."""
     labelled: tuple[int, ...] = (10, 30, 100, 300, 1_680)
     """Labelled contacts; more than there are means all."""
     unlabelled: int = 300
@@ -98,9 +104,13 @@ class FewLabelsConfig(StudyConfig):
     grpo_steps: int = 40
     samples: int = 0
     pretrain: PretrainConfig = PretrainConfig(
-        encoder=TactileViTConfig(sensors=0, causal=True), objective="physics", steps=300, probe_every=300, batch_size=16
+        encoder=TactileViTConfig(sensors=0, causal=True, stem_px=2),
+        image_px=SIDE_PX,
+        objective="contrast",
+        steps=300,
+        probe_every=300,
     )
-    """Stage 1 on the touch of all training objects."""
+    """Stage 1 on the touch of all training objects, by the objective that gained most in `stage_one`."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
