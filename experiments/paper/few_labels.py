@@ -6,9 +6,9 @@ Policies are trained with 10, 30, 100, 300 and all labelled contacts, from a ran
 has pretrained on the touch of all training objects (contrast between the sensors of a contact): by SFT end to end
 (`sft`), or in two phases, of the encoders by a linear head and of the decoder (`two_phases`).  From there, GRPO trains
 on the labelled contacts (`grpo`); GRPO also asks about unlabelled contacts and rewards the level on which most single
-sensors agree (`agreement`); or GRPO rewards the level that measured physics implies (`physics`): hardness from the slope
-of force over indentation, roughness from friction force over load where a contact slides.  All policies are scored once
-on test objects.
+sensors agree (`agreement`); or GRPO rewards the level that measured physics implies (`physics`): hardness from the
+slope of force over indentation, roughness from friction force over load where a contact slides.  All policies are
+scored once on test objects.
 
 Cost: about half an hour on two cores; `--scale smoke` under two minutes.
 
