@@ -53,8 +53,7 @@ from experiments.study.study import SMOKE as SMOKE_STUDY
 from experiments.study.training import DECODER, starting_model
 from sensors_io.schema import SENSORS
 from touchr1_jax.models.policy import Features
-from touchr1_jax.models.tactile_vit import TactileViTConfig
-from touchr1_jax.models.touch_policy import ModelConfig, TouchPolicy, build_policy, check_model, with_lora
+from touchr1_jax.models.touch_policy import TouchPolicy, build_policy, check_model, with_lora
 from touchr1_jax.rewards import uniform_prior
 from touchr1_jax.rl.config import GRPOConfig, Norm, Rloo
 from touchr1_jax.training.evaluation import Evaluation, evaluate_policy
@@ -73,9 +72,6 @@ METHODS: tuple[Method, ...] = ("sft", "two_phases", "grpo", "agreement", "physic
 
 RANDOM, PRETRAINED = "random", "pretrained"  # encoders that SFT starts from
 
-SIDE_PX = 56
-"""Side of the tactile pictures: a stem of 2 px makes as many tokens of them as one of 4 of 112, for a quarter."""
-
 COMPARED = ("acc", "omae", "mat_acc")
 
 
@@ -84,8 +80,6 @@ class FewLabelsConfig(StudyConfig):
     """A study for each number of labels and each encoder."""
 
     seeds: int = 3
-    model: ModelConfig = dataclasses.replace(MODEL, image_px=SIDE_PX)
-    """Sizes; the shape of the tactile encoder is that of stage 1, also where it starts from random parameters."""
     labelled: tuple[int, ...] = (10, 30, 100, 300, 1_680)
     """Labelled contacts; more than there are means all."""
     unlabelled: int = 300
@@ -103,14 +97,9 @@ class FewLabelsConfig(StudyConfig):
     )
     grpo_steps: int = 40
     samples: int = 0
-    pretrain: PretrainConfig = PretrainConfig(
-        encoder=TactileViTConfig(sensors=0, causal=True, stem_px=2),
-        image_px=SIDE_PX,
-        objective="contrast",
-        steps=300,
-        probe_every=300,
-    )
-    """Stage 1 on the touch of all training objects, by the objective that gained most in `stage_one`."""
+    pretrain: PretrainConfig = PretrainConfig(encoder=MODEL.tactile, objective="contrast", steps=300, probe_every=300)
+    """Stage 1 of the studies' encoder on the touch of all training objects, by the objective that gained most in
+    `stage_one`."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

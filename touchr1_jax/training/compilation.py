@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes
+import gc
 import hashlib
 import os
 import platform
@@ -25,6 +26,11 @@ OLDER_LOOPS = "--xla_cpu_use_fusion_emitters=false" if jax.__version_info__ < (0
 
 FLAGS = "XLA_FLAGS"
 """Environment variable that XLA reads when it compiles its first program, and never again."""
+
+
+MAPPINGS, MAPPINGS_LIMIT = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
+MAPPINGS_SHARE = 0.5
+"""Share of the mappings from which on programs are dropped before a stage: what is left is enough for any stage."""
 
 
 @contextlib.contextmanager
@@ -107,6 +113,24 @@ def return_memory() -> None:
     library = ctypes.CDLL(None)
     if hasattr(library, "malloc_trim"):
         library.malloc_trim(0)
+
+
+def drop_programs(share: float = MAPPINGS_SHARE) -> bool:
+    """Drop all compiled programs where the process uses this share of the memory mappings that Linux allows; whether.
+
+    XLA maps each kernel of a program for CPUs, some 2,000 mappings a training step, and beyond the limit its compiler
+    ends the process (`vm.max_map_count`, by default 65,530).  A dropped program is compiled again when it is called, or
+    read from the cache of `compilations_kept`.
+    """
+    if not MAPPINGS_LIMIT.exists():
+        return False
+    with MAPPINGS.open("rb") as lines:
+        used = sum(1 for _ in lines)
+    if used < share * int(MAPPINGS_LIMIT.read_text()):
+        return False
+    jax.clear_caches()
+    gc.collect()
+    return True
 
 
 def processor() -> str:

@@ -16,6 +16,7 @@ from touchr1_jax.training.compilation import (
     committed,
     compilations_kept,
     compiled_quickly,
+    drop_programs,
     processor,
     remove_half_written,
     return_memory,
@@ -149,3 +150,15 @@ def test_a_step_compiles_once_whatever_part_of_its_state_came_from_a_checkpoint(
     assert compiled(committed(state)) == 1
     assert compiled(SingleDevice().shard(None, state, None, 1)[1]) == 1
     assert committed(state)["params"] is of_checkpoint
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="only Linux counts mappings")
+def test_programs_are_dropped_and_compiled_again():
+    mappings = lambda: len(Path("/proc/self/maps").read_text().splitlines())
+    programs = [jax.jit(lambda x, k=k: jnp.tanh(x @ x + k) @ x) for k in range(8)]
+    of_all = lambda: [float(program(jnp.eye(3)).sum()) for program in programs]
+    before, filled = of_all(), mappings()
+    assert not drop_programs(share=1.0)
+    assert drop_programs(share=0.0)
+    assert mappings() < filled - len(programs)
+    assert of_all() == before
