@@ -41,6 +41,7 @@ from experiments.engine.peers import BETA, JobSize, Peer, PeerFailed, PeerJob, P
 from experiments.engine.processes import in_own_process
 from touchr1_jax.rl.config import GRPOConfig
 from touchr1_jax.rl.grpo import compiles_leanly
+from touchr1_jax.validation import at_least
 
 K = TypeVar("K")
 TimedJob = tuple[JobSize, int, GRPOConfig, int]  # size, prefix, step, rounds
@@ -80,6 +81,7 @@ class SpeedConfig:
     size: JobSize = JobSize()
 
     def __post_init__(self) -> None:
+        at_least(self, 0, "words")
         missing = sorted({*self.repeated_at} - {*self.prefixes})
         if missing or not self.repeated_at:
             raise ValueError(f"repeated_at is {self.repeated_at}: must be of prefixes {self.prefixes}; add them there")

@@ -1,6 +1,7 @@
 """Steps of a policy on a Qwen-VL in shapes alone: compiled, and run on drawn weights."""
 
 import dataclasses
+import functools
 import time
 from typing import Any
 
@@ -15,6 +16,7 @@ from touchr1_jax.distributed.memory import GRPOShape
 from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.models.load import peak_memory
 from touchr1_jax.models.lora import LoraConfig, init_adapters
+from touchr1_jax.models.nf4 import quantised
 from touchr1_jax.models.policy import init_policy
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.qwen.config import QwenConfig
@@ -83,7 +85,7 @@ def grpo_step(config: QwenConfig, shape: StepShape) -> tuple[Any, tuple[Any, ...
     prompt = prompt_of(config, shape)
     of = GRPOShape(decoder=config.decoder, grpo=grpo, mesh=MeshConfig(), prompt_tokens=prompt.tokens)
     optimizer = falling_adamw(1e-5, 0.1, 10, 1.0)
-    abstract = abstract_grpo(config, prompt, of, optimizer, lora=shape.lora)
+    abstract = abstract_grpo(config, prompt, of, optimizer, lora=shape.lora, four_bits=shape.model.four_bits)
 
     def step(state: Any, batch: Any, frozen: Any, base: Params) -> Any:
         fns = dataclasses.replace(abstract.fns, base=base)
@@ -110,6 +112,7 @@ def sft_step(config: QwenConfig, shape: StepShape) -> tuple[Any, tuple[Any, ...]
     params = dict(jax.eval_shape(fresh, touch))
     base = {name: jax.tree.map(_half, params.pop(name)) for name in ("vision", "decoder")}
     params[ADAPTERS] = jax.eval_shape(lambda p: init_adapters(jax.random.key(0), p, shape.lora), base)
+    base = jax.eval_shape(quantised, base) if shape.model.four_bits else base
     optimizer = make_optimizer(OptimizerConfig(learning_rate=1e-5), 10)
     of: Any = jax.ShapeDtypeStruct
     state = SFTState(params=params, opt_state=jax.eval_shape(optimizer.init, params), step=of((), jnp.int32))
@@ -147,13 +150,16 @@ def _half(x: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
 
 
 def drawn(shapes: Any) -> Any:
-    """Arrays of these shapes: weights of about 0.02, small whole numbers, all true; scales are 1."""
+    """Arrays of these shapes: weights of about 0.02, small whole numbers, all true; scales of norms are 1."""
 
     def draw(path: tuple[Any, ...], x: Any) -> jax.Array:
         if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
             return jax.random.key(0)
         name = jax.tree_util.keystr(path, simple=True, separator="/")
-        return _draw(x.shape, x.dtype, "scale" in name, "opt_state" in name or x.dtype == jnp.int32)
+        if name.endswith("kernel/codes"):
+            return _wave(x.shape, x.dtype, 128.0, 127.0)
+        one = "scale" in name and not name.endswith("kernel/scale")
+        return _draw(x.shape, x.dtype, one, "opt_state" in name or x.dtype == jnp.int32)
 
     return jax.tree_util.tree_map_with_path(draw, shapes)
 
@@ -163,10 +169,11 @@ def _draw(shape: tuple[int, ...], dtype: Any, one: bool, zero: bool) -> jax.Arra
         return jnp.ones(shape, dtype)
     if zero or not jnp.issubdtype(dtype, jnp.floating):
         return jnp.zeros(shape, dtype)
+    return _wave(shape, dtype, 0.0, 0.02)
 
-    @jax.jit
-    def wave() -> jax.Array:  # fused: no more memory than the array's
-        index = sum(jax.lax.broadcasted_iota(jnp.float32, shape, i) * (12.9898 + 7.233 * i) for i in range(len(shape)))
-        return (0.02 * jnp.sin(index * index)).astype(dtype)
 
-    return wave()
+@functools.partial(jax.jit, static_argnums=(0, 1, 2, 3))
+def _wave(shape: tuple[int, ...], dtype: Any, middle: float, height: float) -> jax.Array:
+    """Fused: no more memory than the array's."""
+    index = sum(jax.lax.broadcasted_iota(jnp.float32, shape, i) * (12.9898 + 7.233 * i) for i in range(len(shape)))
+    return (middle + height * jnp.sin(index * index)).astype(dtype)

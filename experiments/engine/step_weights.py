@@ -26,6 +26,7 @@ from experiments.engine.load_checkpoints import SHAPES
 from experiments.engine.processes import in_own_process
 from experiments.engine.step_shapes import StepShape, compiled_step, run_step
 from touchr1_jax.models.qwen.config import QwenVisionConfig
+from touchr1_jax.validation import at_least
 
 STAGES = ("SFT", "GRPO")
 GB = 1e9
@@ -50,6 +51,7 @@ class StepWeightsConfig:
     most_bytes: float = 20e9
 
     def __post_init__(self) -> None:
+        at_least(self, 0, "shallow")
         if self.size not in SHAPES:
             raise ValueError(f"size is {self.size!r}: must be one of {', '.join(SHAPES)}; correct it")
 

@@ -41,7 +41,9 @@ def memory_bytes(
     shape = grpo_shape(config, policy, mesh)
     text = layout.ids.shape[1] - streams * touch - view
     prompt = PromptShape(streams=streams, stream_tokens=touch, view_tokens=view, text_tokens=text)
-    step = abstract_grpo(released, prompt, shape, falling_adamw(1.0, 1.0, 1, 1.0), lora=config.lora)
+    step = abstract_grpo(
+        released, prompt, shape, falling_adamw(1.0, 1.0, 1, 1.0), lora=config.lora, four_bits=policy.model.four_bits
+    )
     lines = grpo_bytes(shape, step.state, step.batch, step.frozen, step.base)
     contacts = len(data.parts["grpo"]) + len(data.parts["test"])
     of_contact = released.decoder.hidden_size * (

@@ -10,9 +10,10 @@ SFT trains the encoder and low-rank adapters on verified answers; GRPO with the 
 counterfactual KL continues to train the adapters.  The adapters are never merged into the released weights during
 scoring, resuming or saving, because rounding to the weights' type would lose small changes.  `--lora.targets` names
 the adapted layers of the decoder, `--lora.vision-targets` those of the vision tower, `--lora.rank-stabilised` scales
-by rsLoRA.  The policy is scored on unseen objects and compared with the released model, which sees the picture and no
-touch, with the same training without touch, and with constants; it is evaluated again under each control of touch.
-The run saves it in `policies/NAME/SEED`, with adapters in PEFT's format, and evaluates it again from there.
+by rsLoRA, and `--model.four-bits` holds the decoder's frozen kernels in four bits (QLoRA).  The policy is scored on
+unseen objects and compared with the released model, which sees the picture and no touch, with the same training without
+touch, and with constants; it is evaluated again under each control of touch.  The run saves it in `policies/NAME/SEED`,
+with adapters in PEFT's format, and evaluates it again from there.
 `python -m experiments ask RUN/touch_r1/0 INPUT` asks it about new data;
 `python -m experiments export RUN/touch_r1/0 FOLDER` merges it into whole weights.
 
@@ -170,6 +171,11 @@ class TouchR1Config(TrainingConfig):
             )
         if self.rollouts.url is not None:
             check_served(self.grpo)
+            if self.model.four_bits:
+                raise ValueError(
+                    "model.four_bits is True: must be False where a server draws rollouts from the weights as they are "
+                    "released; leave out either"
+                )
 
 
 def run(config: TouchR1Config, context: Context) -> Results:
@@ -231,7 +237,7 @@ def begin(config: TouchR1Config, source: Path, context: Context) -> tuple[Releas
     server = released.rollout_server(config.rollouts, context)
     model = dataclasses.replace(config.model, in_order=config.model.in_order or server is not None)
     with context.progress_callback("reading weights, MB") as report:
-        found = load_checkpoint(source, jnp.dtype(model.dtype), in_megabytes(report))
+        found = load_checkpoint(source, jnp.dtype(model.dtype), in_megabytes(report), four_bits=model.four_bits)
     released.require_same(source, context)
     ahead = build_released_policy(model, found, SENSORS)
     ahead.check(touch_shapes(model, model.view_px, SENSORS))

@@ -13,6 +13,7 @@ import optax
 from touchr1_jax.distributed.memory import Compiled, GRPOShape, compiled_bytes
 from touchr1_jax.distributed.placement import gather_params, shard_step
 from touchr1_jax.models.lora import LoraConfig, init_adapters
+from touchr1_jax.models.nf4 import quantised
 from touchr1_jax.models.policy import Features, Slots
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.qwen.config import QwenConfig
@@ -69,6 +70,7 @@ def abstract_grpo(
     optimizer: optax.GradientTransformation,
     *,
     lora: LoraConfig | None = None,
+    four_bits: bool = False,
     attributes: int = 4,
     draws: int = 64,
 ) -> AbstractStep:
@@ -80,6 +82,7 @@ def abstract_grpo(
       shape: sizes of the step; its decoder is the config's.
       optimizer: whose state is counted.
       lora: adapters to train on a decoder that is frozen in bfloat16; `None` trains the decoder.
+      four_bits: the kernels of the frozen decoder's layers are in four bits (`models.nf4`).
       attributes: of a question's target.
       draws: size of the bank of noise.
     """
@@ -112,6 +115,7 @@ def abstract_grpo(
     params: Params = decoder
     if lora is not None:
         base = jax.tree.map(lambda x: of(x.shape, jnp.bfloat16), decoder)
+        base = jax.eval_shape(quantised, base) if four_bits else base
         params = {ADAPTERS: jax.eval_shape(lambda k: init_adapters(k, decoder, lora), key)}
         fns = dataclasses.replace(fns, lora=lora)
     state = jax.eval_shape(lambda p, k: start_state(p, optimizer, k, shape.grpo), params, key)

@@ -144,7 +144,7 @@ def rule(path: str, rank: int) -> tuple[Axis, ...]:
     Raises:
       ValueError: a path that no rule names, or a rule for arrays of another rank.
     """
-    modules = path.split("/")
+    modules = re.sub(r"(?<=/kernel)/(codes|scale)$", "", path).split("/")  # both parts of `Nf4` lie as the matrix
     *_, layer, leaf = ("", *modules)
     axes = _rule(re.sub(r"_\d+$", "", layer), leaf)
     if axes is None:

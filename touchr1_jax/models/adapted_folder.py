@@ -26,7 +26,7 @@ from touchr1_jax.models.lora import LoraConfig, by_layer, exported, kept_share
 from touchr1_jax.models.qwen.config import CONFIG_FILE
 from touchr1_jax.models.qwen.peft import PEFT_CONFIG, PEFT_WEIGHTS, load_adapters, save_adapters
 from touchr1_jax.models.qwen.safetensors import ReportBytes, read_header, read_tensor, write_file
-from touchr1_jax.models.qwen.weights import INDEX, SINGLE, save_params
+from touchr1_jax.models.qwen.weights import INDEX, SINGLE, load_params, save_params
 from touchr1_jax.models.released_policy import ReleasedModel, ReleasedPolicy, build_released_policy, instruction
 from touchr1_jax.models.saved_policy import (
     CARD,
@@ -116,8 +116,9 @@ def read_adapted(
                 f"policy is {folder}: its released weights are not in {released}; say where by --weights DIR"
             )
         require_marks(folder, released, config["weights"]["files"])
-        model = rebuilt(ReleasedModel, {"in_order": False, **config["model"]})  # older folders do not say it
-        found = found or load_checkpoint(released, jnp.dtype(model.dtype), progress)
+        newer = {"in_order": False, "four_bits": False}  # older folders do not say it
+        model = rebuilt(ReleasedModel, {**newer, **config["model"]})
+        found = found or load_checkpoint(released, jnp.dtype(model.dtype), progress, four_bits=model.four_bits)
         adapters, lora = load_adapters(folder, found.config)
         policy = build_released_policy(_without_sensors(model), found, tuple(config["sensors"]))
         lora = _same_lora(rebuilt(LoraConfig, config["lora"]), lora, adapters)
@@ -157,6 +158,8 @@ def read_saved(folder: Path, weights: Path | None = None) -> SavedPolicy:
 def export_merged(folder: Path, saved: SavedPolicy, dtype: jnp.dtype, progress: ReportBytes = SILENT) -> float:
     """Publish the released folder with the adapters merged into its weights, and the touch encoder beside them.
 
+    Of a base in four bits the released weights are read again, which is what adapters are usually merged into.
+
     Args:
       folder: new, or empty.
       saved: a policy on released weights.
@@ -173,7 +176,11 @@ def export_merged(folder: Path, saved: SavedPolicy, dtype: jnp.dtype, progress: 
     assert isinstance(policy, ReleasedPolicy)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise PolicyError(f"folder is {folder}: it exists and is not empty; choose a new one")
-    base = {name: jax.tree.map(lambda x: x.astype(dtype), saved.params[name]) for name in ("decoder", "vision")}
+    released = {name: saved.params[name] for name in ("decoder", "vision")}
+    if policy.model.four_bits:
+        read = load_params(policy.checkpoint.directory, policy.checkpoint.config, dtype)
+        released = {"decoder": read["decoder"], "vision": {"tower": read["vision"]}}
+    base = jax.tree.map(lambda x: x.astype(dtype), released)
     whole = exported({**base, ADAPTERS: saved.params[ADAPTERS]}, policy.fns.lora)
     merged = {"vision": whole["vision"]["tower"], "decoder": whole["decoder"]}
     with published(folder) as unfinished:

@@ -53,6 +53,8 @@ def load_checkpoint(
     directory: str | Path,
     dtype: jnp.dtype | type = jnp.bfloat16,
     progress: ReportBytes = lambda done_bytes, all_bytes: None,
+    *,
+    four_bits: bool = False,
 ) -> Checkpoint:
     """Read a checkpoint; small files first, so that a wrong one is refused before the weights are read.
 
@@ -61,24 +63,25 @@ def load_checkpoint(
         template, and the weights as `load_params` reads them.
       dtype: type of all parameters.
       progress: told of the weights as `load_params` tells.
+      four_bits: as in `load_params`; for a base of adapters.
 
     Raises:
       FileNotFoundError: a file that is missing.
       WeightsError: one that does not fit.
     """
     try:
-        return _read(Path(directory), dtype, progress)
+        return _read(Path(directory), dtype, progress, four_bits)
     except ValueError as error:
         raise WeightsError(str(error)) from error
 
 
-def _read(directory: Path, dtype: jnp.dtype | type, progress: ReportBytes) -> Checkpoint:
+def _read(directory: Path, dtype: jnp.dtype | type, progress: ReportBytes, four_bits: bool) -> Checkpoint:
     config = read_config(directory)
     tokenizer = from_file(directory / TOKENIZER_FILE, vocab_size=config.decoder.vocab_size)
     check_ids(tokenizer, config)
     check_template(directory, config.vision.model_type)
     budget = read_budget(directory, config.vision)
-    params = load_params(directory, config, dtype, progress=progress)
+    params = load_params(directory, config, dtype, progress=progress, four_bits=four_bits)
     return Checkpoint(config=config, params=params, tokenizer=tokenizer, budget=budget, directory=directory)
 
 

@@ -35,6 +35,8 @@ class ReleasedModel(TouchConfig):
     view_px: int = 224
     """Rows and columns of the object's picture; the released vision towers make one token of 28² or 32² pixels."""
     dtype: Literal["bfloat16", "float32"] = "bfloat16"
+    four_bits: bool = False
+    """Hold the kernels of the decoder's layers in four bits (`models.nf4`), under adapters: QLoRA."""
     in_order: bool = False
     """Number a prompt's tokens one by one, as a server does that draws rollouts from their embeddings alone."""
 
@@ -47,6 +49,7 @@ class ReleasedModel(TouchConfig):
 class ReleasedPolicy(TouchPolicy):
     """A policy whose vision tower and decoder are a checkpoint's."""
 
+    model: ReleasedModel
     checkpoint: Checkpoint
 
     @property

@@ -21,6 +21,8 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float
 
+from touchr1_jax.models.nf4 import Nf4
+
 
 def linear(x: Float[Array, "*n i"], w: Float[Array, "i o"]) -> Float[Array, "*n o"]:
     """x W over all rows of x, in their common type.
@@ -49,9 +51,15 @@ def product_with_weights(primitive: Primitive, *_: Any, **__: Any) -> bool:
 
 
 class Dense(nn.Dense):
-    """Flax's dense layer, x W + b, by `linear`."""
+    """Flax's dense layer, x W + b, by `linear`; a frozen W may be `Nf4`, which is decoded where it is used."""
 
     dot_general: Callable[..., Array] | None = _as_dot_general
+
+    @nn.nowrap
+    def param(self, name: str, *args: Any, **kwargs: Any) -> Any:
+        """A parameter, as Flax's layer asks for it."""
+        stored: Any = self.get_variable("params", name)
+        return stored.decode() if isinstance(stored, Nf4) else super().param(name, *args, **kwargs)
 
 
 class Embed(nn.Embed):

@@ -5,6 +5,8 @@ import dataclasses
 import pytest
 
 from experiments.core.sizes import require_sizes
+from experiments.engine import speed_grpo, step_weights
+from experiments.paper import touch_r1
 from touchr1_jax.validation import at_least
 
 
@@ -57,3 +59,12 @@ def test_what_no_scale_has_is_refused(change, said):
 def test_what_a_scale_has_or_a_class_checks_itself_is_taken():
     training = Training(shift=-3.0, first_seed=0, rate=0.0, forces=(0.0,), kept=False)
     require_sizes(Config(training=training, checked=Checked(steps=0), moments=0, most=-1), SCALES)
+
+
+@pytest.mark.parametrize(
+    ("module", "change"),
+    [(step_weights, {"shallow": 0}), (speed_grpo, {"words": 0}), (touch_r1, {"teaching_steps": 0})],
+)
+def test_a_0_that_is_documented_is_taken(module, change):
+    of = module.EXPERIMENT
+    require_sizes(dataclasses.replace(of.config, **change), (of.config, *of.scales.values()))

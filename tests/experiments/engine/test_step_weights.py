@@ -1,5 +1,7 @@
 """Steps of released shapes: their arguments in shapes alone, and the experiment on a tiny one."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,6 +32,15 @@ def test_what_is_frozen_is_bfloat16_and_what_is_trained_is_not(stage, towers):
     assert {x.dtype for x in jax.tree.leaves(base)} == {jnp.dtype(jnp.bfloat16)}
     assert {x.dtype for x in jax.tree.leaves(state.params)} == {jnp.dtype(jnp.float32)}
     assert state.params["adapters"]["decoder"]["layers"]["q_proj"]["a"].shape == (35, 2048, 2)
+
+
+def test_a_base_in_four_bits_has_three_tenths_of_the_bytes_of_bfloat16():
+    size = lambda step: sum(
+        x.size * x.dtype.itemsize for x in jax.tree.leaves(abstract_step(SHAPES["7B"], step, "SFT")[1][-1])
+    )
+    stored = dataclasses.replace(STEP, model=dataclasses.replace(STEP.model, four_bits=True))
+    kernels = 28 * 3584 * (2 * 3584 + 2 * 512 + 3 * 18944)
+    assert size(STEP) - size(stored) == kernels * (2 - 0.5 - 2 / 32)
 
 
 def test_drawn_weights_are_small_and_scales_are_one():

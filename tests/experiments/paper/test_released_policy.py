@@ -24,8 +24,10 @@ from touchr1_jax.models.lora import with_adapters
 from touchr1_jax.models.qwen.config import released
 from touchr1_jax.models.qwen.config_file import parse_config
 from touchr1_jax.models.qwen.safetensors import read_header, read_tensor, write_file
+from touchr1_jax.models.qwen.weights import SINGLE
 from touchr1_jax.models.released_policy import build_released_policy, instruction, longest_answer, plain_answers
 from touchr1_jax.models.saved_policy import PolicyError, PolicyInput, SavedPolicy, digest_of, seal
+from touchr1_jax.models.touch_policy import with_lora
 
 SFT = StudySFT(batch_size=3, questions=2, micro_contacts=1)
 
@@ -116,6 +118,23 @@ def test_a_written_policy_describes_itself(folder, saved):
     assert jax.tree.all(jax.tree.map(np.array_equal, found.params, saved.params))
     assert (found.policy.fns.lora, found.policy.model) == (LORA, saved.policy.model)
     assert (found.reads, found.notes, found.sensors) == (saved.reads, saved.notes, saved.sensors)
+
+
+@pytest.mark.long
+def test_a_policy_in_four_bits_is_read_again_and_exported_from_the_released_weights(saved, weights, streamed, tmp_path):
+    found = load_checkpoint(weights, jnp.float32, four_bits=True)
+    model = dataclasses.replace(saved.policy.model, four_bits=True)
+    policy = with_lora(build_released_policy(model, found, streamed.clip.sensors), LORA)
+    params = {**saved.params, "decoder": found.params["decoder"]}
+    stored = dataclasses.replace(saved, policy=policy, params=params)
+    save_adapted(tmp_path / "policy", stored, str(weights))
+    again, batch = read_adapted(tmp_path / "policy"), tiny.one_batch(streamed)
+    ours, theirs = (first_logits(x.policy, x.params, batch) for x in (stored, again))
+    np.testing.assert_array_equal(ours, theirs)
+    assert np.abs(ours - first_logits(saved.policy, saved.params, batch)).max() > 1e-3
+    export_merged(tmp_path / "ours", again, jnp.dtype(jnp.float32))
+    export_merged(tmp_path / "theirs", saved, jnp.dtype(jnp.float32))
+    assert (tmp_path / "ours" / SINGLE).read_bytes() == (tmp_path / "theirs" / SINGLE).read_bytes()
 
 
 @pytest.mark.long

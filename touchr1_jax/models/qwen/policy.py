@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
+from touchr1_jax.models.nf4 import Nf4
 from touchr1_jax.models.policy import Policy, PolicyConfig, Slots, init_policy
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.qwen.config import AnyVision, QwenConfig
@@ -126,7 +127,7 @@ def init_on_pretrained(
     taken = {"vision": {"tower": pretrained["vision"]}, "decoder": pretrained["decoder"]}
     fresh = lambda k: init_policy(policy, k, batch, ids, mask, slots)
     wanted = jax.eval_shape(fresh, key)
-    shapes = lambda tree: jax.tree.map(lambda x: x.shape, tree)
+    shapes = lambda tree: jax.tree.map(lambda x: x.shape, tree, is_leaf=lambda x: isinstance(x, Nf4))
     if shapes(taken) != shapes({name: wanted[name] for name in taken}):
         raise ValueError("pretrained has other shapes than the policy's towers; build the policy from its config")
     others = jax.jit(lambda k: {name: tree for name, tree in fresh(k).items() if name not in taken})

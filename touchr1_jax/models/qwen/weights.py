@@ -9,6 +9,7 @@ import json
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import flax.traverse_util
 import jax
@@ -17,6 +18,7 @@ import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec, Sharding
 from jaxtyping import Array
 
+from touchr1_jax.models.nf4 import Nf4, encode, quantised
 from touchr1_jax.models.qwen import names, safetensors
 from touchr1_jax.models.qwen.config import QwenConfig
 from touchr1_jax.models.qwen.model import abstract_params
@@ -36,6 +38,8 @@ def load_params(
     dtype: jnp.dtype | type = jnp.bfloat16,
     place: Callable[[Params], Params] | None = None,
     progress: safetensors.ReportBytes = lambda done_bytes, all_bytes: None,
+    *,
+    four_bits: bool = False,
 ) -> Params:
     """Parameters of `QwenVL` from the safetensors files of a directory.
 
@@ -49,6 +53,7 @@ def load_params(
       place: from shapes to the sharding of each parameter, such as `rules.state_shardings` of a mesh; each device gets
         its part of a tensor as it is read.  `None` puts all on JAX's default device.
       progress: called before the first tensor and after each with the bytes of the files that are read, and all.
+      four_bits: encode kernels as `nf4.quantised` does, each after it is read.
 
     Raises:
       FileNotFoundError: no weights, or a shard that is missing.
@@ -59,16 +64,18 @@ def load_params(
     wanted = sources(config)
     require_fit(Path(directory), entries, wanted, config)
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, dtype), abstract_params(config))
+    shapes = jax.eval_shape(quantised, shapes) if four_bits else shapes
     whole = jax.sharding.SingleDeviceSharding(jnp.zeros(()).device)
     places = jax.tree.map(lambda _: whole, shapes) if place is None else place(shapes)
     flat, lies = flax.traverse_util.flatten_dict(shapes), flax.traverse_util.flatten_dict(places)
     done, size = 0, sum(entry.size for entry in entries.values())
-    loaded: dict[names.Path, Array] = {}
+    loaded: dict[names.Path, Any] = {}
     progress(done, size)
     for s in sorted(wanted.values(), key=lambda s: -math.prod(s.shape)):
-        found, finite = _place(entries[s.key], s, flat[s.path].dtype, lies[s.path])
+        found, finite = _place(entries[s.key], s, flat[s.path].dtype, jax.tree.leaves(lies[s.path])[0])
+        found = encode(found) if isinstance(flat[s.path], Nf4) else found
         if s.row is not None:
-            stack = loaded.pop(s.path) if s.path in loaded else _empty(flat[s.path], lies[s.path])
+            stack = loaded.pop(s.path) if s.path in loaded else jax.tree.map(_empty, flat[s.path], lies[s.path])
             found = _with_row(stack, found, s.row)
         loaded[s.path] = jax.block_until_ready(found)
         if not finite:
@@ -235,5 +242,5 @@ def _lay_out(raw: Array, turned: bool, dtype: jnp.dtype) -> tuple[Array, Array]:
 
 
 @functools.partial(jax.jit, donate_argnums=0)
-def _with_row(stack: Array, row: Array, i: int) -> Array:
-    return jax.lax.dynamic_update_index_in_dim(stack, row, i, 0)
+def _with_row(stack: Any, row: Any, i: int) -> Any:
+    return jax.tree.map(lambda x, y: jax.lax.dynamic_update_index_in_dim(x, y, i, 0), stack, row)

@@ -13,6 +13,7 @@ from tests.touchr1_jax.models.qwen import tiny
 from tests.touchr1_jax.models.qwen.cases import CASES
 from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.distributed.rules import state_shardings
+from touchr1_jax.models.nf4 import quantised
 from touchr1_jax.models.qwen.config import released
 from touchr1_jax.models.qwen.model import abstract_params, init_params
 from touchr1_jax.models.qwen.safetensors import write_file
@@ -89,6 +90,11 @@ def test_every_layout_gives_the_same_parameters(tmp_path, weights, expected, ren
     else:
         write_file(tmp_path / "model.safetensors", rename(weights))
     assert_equal(load_params(tmp_path, CONFIG, jnp.float32), expected)
+
+
+def test_kernels_are_encoded_as_they_are_read(tmp_path, weights, expected):
+    write_file(tmp_path / "model.safetensors", weights)
+    assert_equal(load_params(tmp_path, CONFIG, jnp.float32, four_bits=True), quantised(expected))
 
 
 @pytest.mark.long
