@@ -13,7 +13,7 @@ object's touch, the same touch in another order.
 Cost: two minutes after `main_table`, whose policies it evaluates, about 27 without; `--scale smoke` under two.
 
 Expected: the policy without touch follows the picture and is right on few deceptive questions, where it disagrees with
-those of other seeds; the full model is right in more than half of them.  Touch adds about 35 points over every control
+those of other seeds; the full model is right in more than half of them.  Touch adds over 40 points over every control
 except the order of the frames of a press, which contains almost no information.
 """
 

@@ -101,7 +101,22 @@ SCOPE = (
 )
 
 
-def markdown(found: tuple[ClaimOutcome, ...]) -> str:
+def recipes(root: Path = ROOT) -> str:
+    """A sentence that names the recipe of SFT of each recorded study."""
+    studies: dict[str, list[str]] = {"paper": [], "touch": []}
+    for name in dict.fromkeys(claim.experiment for claim in CLAIMS):
+        config = (_recorded(name, root) or {}).get("config", {})
+        study = config.get("study", config)
+        if "grpo_steps" in study:
+            studies[study.get("recipe", "paper")].append(f"`{name}`")
+    by_recipe = {recipe: ", ".join(names) for recipe, names in studies.items()}
+    return (
+        f"SFT is end to end, as published, in {by_recipe['paper'] or 'no run'}; in {by_recipe['touch'] or 'none'} "
+        "the encoders are trained first, with a linear head, and then the decoder, which answers more questions right."
+    )
+
+
+def markdown(found: tuple[ClaimOutcome, ...], root: Path = ROOT) -> str:
     """REPRODUCTION.md."""
     cell = lambda text: text.replace("|", "\\|")
     lines = [
@@ -109,7 +124,7 @@ def markdown(found: tuple[ClaimOutcome, ...]) -> str:
         "",
         "`python -m experiments.paper.reproduction` writes this page from the runs in `recorded/`.",
         "",
-        f"{summary(found)} {SCOPE}",
+        f"{summary(found)} {SCOPE} {recipes(root)}",
         "",
         "`python -m experiments show EXPERIMENT` renders the run behind a row as its report; "
         "`make experiment EXP=EXPERIMENT` measures it again. The [glossary](../docs/GLOSSARY.md) explains OMAE, CSC "
@@ -154,7 +169,7 @@ def chart(root: Path = ROOT) -> bytes:
 def write(root: Path = ROOT) -> Path:
     """Write the page, its figure and the report of a checkout; the path of the report."""
     found, picture = outcomes(root), chart(root)
-    write_text(root / PAGE, markdown(found))
+    write_text(root / PAGE, markdown(found, root))
     write_bytes(root / FIGURE, picture)
     rows = [
         {"claim": o.claim, "paper": o.paper, "ours": o.ours, "verdict": o.verdict, "why": o.why, "command": o.command}
@@ -162,7 +177,7 @@ def write(root: Path = ROOT) -> Path:
     ]
     caption = "Changes of every recorded claim with 95 % intervals, and the paper's where it prints one."
     results = Results(
-        verdict=(summary(found), SCOPE),
+        verdict=(summary(found), SCOPE, recipes(root)),
         tables=(
             named_table("Claims", rows[: len(CLAIMS)]),
             named_table("Where the paper's own numbers decide", rows[len(CLAIMS) :]),
