@@ -79,6 +79,29 @@ def test_an_update_without_a_finite_kl_is_left_out(shorten):
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.long
+def test_an_update_to_parameters_that_are_not_finite_is_left_out(learn):
+    after = jax.tree.map(lambda a: jnp.full_like(a, jnp.inf), BEFORE)
+    params, size = jax.jit(lambda after: within_trust(FNS, CONFIG, BEFORE, after, learn, DELTA))(after)
+    assert size["update_scale"] == 0
+    jax.tree.map(np.testing.assert_array_equal, params, BEFORE)
+
+
+@pytest.mark.long
+def test_rollouts_that_are_masked_do_not_make_an_update_look_shorter(learn):
+    """Without the rollouts of one prompt the KL is that of the others, not less."""
+    there = (jnp.arange(P) > 0)[:, None, None]
+    after = jax.tree.map(lambda a, d: a + 0.05 * d, BEFORE, DIRECTION)
+
+    def kl(mask):
+        part = learn._replace(rollout=learn.rollout.replace(mask=mask))
+        return within_trust(FNS, CONFIG, BEFORE, after, part, 1e3)[1]["update_kl"]
+
+    measure, mask = jax.jit(kl), learn.rollout.mask
+    first, others, all_ = (measure(mask & x) for x in (~there, there, True))
+    np.testing.assert_allclose((first + (P - 1) * others) / P, all_, rtol=1e-4)
+
+
 @pytest.mark.parametrize(("kl", "stays"), [(1.3, True), (2.0, False)])
 def test_an_update_is_shortened_from_one_and_a_half_times_the_bound_on(shorten, kl, stays):
     size = 0.1 * np.sqrt(kl * DELTA / shorten(0.1)[1]["update_kl"])
