@@ -1,5 +1,7 @@
 """An update that is too long is shortened to its bound; a short one stays as it is."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -92,10 +94,11 @@ def test_rollouts_that_are_masked_do_not_make_an_update_look_shorter(learn):
     """Without the rollouts of one prompt the KL is that of the others, not less."""
     there = (jnp.arange(P) > 0)[:, None, None]
     after = jax.tree.map(lambda a, d: a + 0.05 * d, BEFORE, DIRECTION)
+    config = dataclasses.replace(CONFIG, algorithm=dataclasses.replace(CONFIG.algorithm, mask_truncated=True))
 
     def kl(mask):
         part = learn._replace(rollout=learn.rollout.replace(mask=mask))
-        return within_trust(FNS, CONFIG, BEFORE, after, part, 1e3)[1]["update_kl"]
+        return within_trust(FNS, config, BEFORE, after, part, 1e3)[1]["update_kl"]
 
     measure, mask = jax.jit(kl), learn.rollout.mask
     first, others, all_ = (measure(mask & x) for x in (~there, there, True))
