@@ -31,7 +31,8 @@ class AugmentConfig:
       turn: probability of a turn by 90, 180 or 270 degrees, each equally likely.
       exposure_stops: exposure of each stream changes by a factor 2^u, u uniform in ± this, in all frames alike.
       white_balance_stops: the same for each colour of each stream.
-      frame_dropout: probability with which each frame of a clip is masked; one of each stream always stays.
+      frame_dropout: probability with which each frame of a clip is masked but the first one of each stream, against
+        which the change of all others is measured.
     """
 
     mirror: float = 0.0
@@ -134,13 +135,12 @@ def jitter_exposure(images: np.ndarray, config: AugmentConfig, rng: np.random.Ge
 
 
 def draw_kept(present: np.ndarray, config: AugmentConfig, rng: np.random.Generator) -> np.ndarray:
-    """Draw the frames of each stream that stay, bool [S, F]: a subset of those present, empty only where none is.
+    """Draw the frames of each stream that stay, bool [S, F]: the first one that is present, and a part of the others.
 
     Args:
       present: bool [S, F].
       config: gives the probability.
       rng: source of randomness.
     """
-    luck = np.where(present, rng.random(present.shape), -1.0)
-    spared = np.arange(present.shape[1]) == luck.argmax(1, keepdims=True)
-    return present & ((luck >= config.frame_dropout) | spared)
+    first = np.arange(present.shape[1]) == present.argmax(1, keepdims=True)
+    return present & ((rng.random(present.shape) >= config.frame_dropout) | first)

@@ -122,7 +122,8 @@ class StudySeed:
             else:
                 feed = touch_rows(touch, rows, **order)
             with stage_hooks(self.context, stage, config.steps) as hooks:
-                return train_encoder(policy, untrained(policy, data, self.seed) | dict(start), feed, config, hooks)
+                whole = untrained(policy, data, self.seed) | dict(start)
+                return train_encoder(policy, whole, feed, config, hooks, seed=self.seed)
 
         values = {"records": data.store.digest, "encoders": config, "clip": data.clip}
         return self._shared("sft", stage, train, values, {"rows": rows, "start": start})

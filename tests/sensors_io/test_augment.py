@@ -108,11 +108,12 @@ class TestDropout:
     @hypothesis.given(
         st.lists(st.lists(st.booleans(), min_size=5, max_size=5), min_size=1), st.floats(0, 1), st.integers(0, 99)
     )
-    def test_some_of_the_present_frames_stay_and_at_least_one(self, present, share, seed):
+    def test_some_of_the_present_frames_stay_and_the_first_one_always(self, present, share, seed):
         present = np.array(present)
         kept = draw_kept(present, AugmentConfig(frame_dropout=share), np.random.default_rng(seed))
         assert not (kept & ~present).any()
-        np.testing.assert_array_equal(kept.any(1), present.any(1))
+        rows = np.flatnonzero(present.any(1))
+        assert kept[rows, present[rows].argmax(1)].all()  # what the change of all others is measured against
 
     def test_the_share_is_kept(self):
         kept = draw_kept(np.ones((4, 5000), bool), AugmentConfig(frame_dropout=0.3), np.random.default_rng(0))

@@ -70,7 +70,8 @@ def score(asks: Sequence[Ask], answers: ItemAnswers, by_sight: ItemAnswers | Non
       by_sight: to those of "conflict", given the picture alone; they are the visual prior.
 
     Raises:
-      ValueError: an item without an answer, or with too few or too many levels.
+      ValueError: an item without an answer, or with too few or too many levels; a group of "one_sensor" that holds
+        several touches or properties.
     """
     _check(asks, answers)
     if by_sight is not None:
@@ -131,7 +132,14 @@ def _order(asks: Sequence[Ask], rows: list[int], answers: ItemAnswers) -> _Parts
 def _one_sensor(asks: Sequence[Ask], rows: list[int], answers: ItemAnswers) -> _Parts:
     groups: dict[str, list[int]] = {}
     for i in rows:
-        groups.setdefault(asks[i].group, []).append(i)
+        members = groups.setdefault(asks[i].group, [])
+        members.append(i)
+        first = asks[members[0]]
+        if (asks[i].touches, asks[i].attributes, asks[i].answer) != (first.touches, first.attributes, first.answer):
+            raise ValueError(
+                f"group {asks[i].group!r} holds {first.id!r} and {asks[i].id!r}: must be of one touch and property, "
+                "felt by one sensor each; give each touch a group of its own"
+            )
     width = max(map(len, groups.values()))
     alone = np.full((len(groups), width, 1), BOTTOM)
     streams = np.zeros((len(groups), width), bool)

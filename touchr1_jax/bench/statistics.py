@@ -87,11 +87,21 @@ def draw_clusters(objects: np.ndarray, *, resamples: int, seed: int) -> tuple[np
     Raises:
       ValueError: fewer than two objects.
     """
-    names, cluster = np.unique(objects, return_inverse=True)
+    cluster = numbered(objects)
+    number = int(cluster.max()) + 1
+    return cluster, np.random.default_rng(seed).multinomial(number, np.full(number, 1 / number), size=resamples)
+
+
+def numbered(objects: np.ndarray) -> np.ndarray:
+    """The number of each object among all of them, int [N].
+
+    Raises:
+      ValueError: fewer than two objects.
+    """
+    names, number = np.unique(objects, return_inverse=True)
     if len(names) < 2:
         raise ValueError(f"objects holds {len(names)}: an interval over objects needs two; ask about more objects")
-    uniform = np.full(len(names), 1 / len(names))
-    return cluster, np.random.default_rng(seed).multinomial(len(names), uniform, size=resamples)
+    return number
 
 
 def drawn_means(values: np.ndarray, cluster: np.ndarray, strata: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -241,7 +251,7 @@ def crossed_test(differences: np.ndarray, clusters: np.ndarray, *, strata: np.nd
     strata = np.zeros(differences.shape[1], int) if strata is None else strata
     _check_values(differences.mean(axis=0), clusters, strata)
     _, stratum, counts = np.unique(strata, return_inverse=True, return_counts=True)
-    _, cluster = np.unique(clusters, return_inverse=True)
+    cluster = numbered(clusters)
     weight = 1 / (len(counts) * counts[stratum] * seeds)
     means = np.bincount(stratum, weights=differences.mean(axis=0)) / counts
     mean = float(means.mean())
@@ -340,17 +350,17 @@ def skill(error: np.ndarray, reference: np.ndarray, objects: np.ndarray, resampl
 
     Args:
       error, reference: [n] of the same contacts, reference > 0 in sum.
-      objects: [n].
+      objects: [n]; resamples of those alone whose reference has no error are left out.
 
     Raises:
-      ValueError: a reference without error, for which no skill is defined.
+      ValueError: a reference without error, for which no skill is defined, or fewer than two objects.
     """
     if not reference.sum() > 0:
         raise ValueError(f"reference sums to {reference.sum()}: must be > 0, or no skill is defined; choose another")
-    names, group = np.unique(objects, return_inverse=True)
-    sums = np.zeros((len(names), 2))
+    group, weights = draw_clusters(objects, resamples=resamples, seed=0)
+    sums = np.zeros((weights.shape[1], 2))
     np.add.at(sums, group, np.stack([error, reference], 1).astype(float))
-    weights = np.random.default_rng(0).multinomial(len(names), np.full(len(names), 1 / len(names)), resamples)
     drawn = weights @ sums
+    drawn = drawn[drawn[:, 1] > 0]
     low, high = np.quantile(1 - drawn[:, 0] / drawn[:, 1], (0.025, 0.975))
     return Interval(mean=float(1 - error.sum() / reference.sum()), low=float(low), high=float(high))

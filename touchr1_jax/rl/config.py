@@ -82,7 +82,7 @@ class Algorithm:
     importance_sequence: bool = False
     """Weight whole rollouts by the product of their ratios, at most `importance_cap`, instead of each token."""
     mismatch_limit: float | None = None
-    """Largest mean |log π_learner − log π_sampler| of a rollout, nat a token; a rollout beyond it is left out."""
+    """Largest mean |log π_old − log π_sampler| of a rollout, nat a token (`losses.grpo_loss`); others are left out."""
     score_centering: int = 0
     """Most likely tokens of the sampler, from which the drift towards it is computed and subtracted; 0 leaves it in."""
     average: Average = Average.ROLLOUT
@@ -155,6 +155,8 @@ class Algorithm:
             if getattr(self, field) != value:
                 needs = f"must be {value} where enumerated is set, because it needs a sampled conclusion; change either"
                 raise ValueError(f"{field} is {getattr(self, field)}: {needs}")
+        if self.kl_in_reward and self.advantage is Advantage.PER_REWARD:
+            raise ValueError("kl_in_reward is True: must be False for PER_REWARD, whose σ takes beta away; change one")
         idle = ("learn_conclusion", "enumerated"), ("importance_sequence", "importance_cap")
         for field, needed in (*idle, ("reference_share", "reference_every")):
             if getattr(self, field) != getattr(type(self), field) and getattr(self, needed) is None:
@@ -168,8 +170,7 @@ class Algorithm:
                 raise ValueError(f"{field} is {getattr(self, field)}: must be ≥ 0 and finite; it is a size, not a sign")
         bounds = "importance_cap mismatch_limit grounding_cap_nat grounding_budget entropy_floor_nat trust_nat"
         for field in bounds.split():
-            bound = getattr(self, field)
-            if bound is not None and not bound > 0:
+            if (bound := getattr(self, field)) is not None and not bound > 0:
                 raise ValueError(f"{field} is {bound}: must be above 0; None leaves it out")
 
 
@@ -341,19 +342,18 @@ class GRPOConfig:
     def __post_init__(self) -> None:
         at_least(self, 1, "prompts", "group", "length", "micro_prompts", "max_logits")
         at_least(self, 0, "learning_rate", "lr_scale", "temperature")
-        within(self, 0, 1, "final_share")
         above(self, 0, "max_grad_norm", "temperature", "top_p")
-        within(self, 0, 1, "top_p", "min_p")
+        within(self, 0, 1, "final_share", "top_p", "min_p")
         if self.prompts % (self.micro_prompts * self.algorithm.minibatches):
             parts = f"{self.algorithm.minibatches} minibatches" if self.algorithm.minibatches > 1 else ""
             raise ValueError(
                 f"micro_prompts {self.micro_prompts}{parts and ' of each of '}{parts} must divide prompts "
                 f"{self.prompts}; choose a divisor of it"
             )
-        if self.group < 2 and self.algorithm.advantage is not Advantage.GLOBAL:
+        if self.group < 2 and (self.algorithm.advantage, self.algorithm.enumerated) != (Advantage.GLOBAL, None):
             raise ValueError(
                 f"group is {self.group}: must be at least 2: a rollout is compared with its group; raise it, or choose "
-                "advantage GLOBAL"
+                "advantage GLOBAL without enumerated"
             )
         if self.algorithm.best_of > 1 and (
             self.algorithm.best_of > self.group or self.algorithm.advantage is Advantage.PER_REWARD

@@ -130,8 +130,11 @@ def policy_objective(
     trace = mask if levels is None else before_level(mask, levels.at)
     a = advantage if exact is None else exact.advantage
     objective, clipped = surrogate(algorithm, terms.log_prob, old, trace, a)
+    reached: float | Array = 1.0  # weight of the level, which is not drawn itself, but after a trace that is
     if algorithm.importance_cap is not None:
-        objective *= jnp.minimum(importance(algorithm, old - sampler, mask), algorithm.importance_cap)
+        importances = jnp.minimum(importance(algorithm, old - sampler, trace), algorithm.importance_cap)
+        objective *= importances
+        reached = importances[..., :1] if algorithm.importance_sequence else 1.0
     if algorithm.score_centering:
         check_centering(algorithm)
         wide = advantage if advantage.ndim == mask.ndim else advantage[..., None]
@@ -140,7 +143,7 @@ def policy_objective(
         return objective, clipped, {}
     expected = {"expected_reward": jnp.mean(exact.expected, -1)}
     if algorithm.learn_conclusion:
-        return conclude_exactly(objective, exact.objective[..., None], levels.at), clipped, expected
+        return conclude_exactly(objective, reached * exact.objective[..., None], levels.at), clipped, expected
     kept = jax.lax.stop_gradient(exact.objective)[..., None] - terms.reference_kl
     return conclude_exactly(objective, kept, levels.at), clipped, expected
 

@@ -41,11 +41,15 @@ def within_trust(
     Returns:
       The parameters θ, and `update_kl`, the KL that was proposed, and `update_scale`, s.
     """
-    between = lambda scale: jax.tree.map(lambda a, b: a + scale * (b - a), before, after)
+    # by selection: 0 times what is not finite is not 0
+    between = lambda scale: jax.tree.map(lambda a, b: jnp.where(scale > 0, a + scale * (b - a), a), before, after)
+    mask, algorithm = learn.rollout.mask, config.algorithm
 
     def moved_by(scale: Float[Array, ""]) -> Float[Array, ""]:
         moved = log_probs(fns, config, between(scale), learn.batch, learn.rollout)
-        return jnp.mean(masked.mean(estimated_kl(learn.old, moved, "k3"), learn.rollout.mask, axis=-1))
+        by_rollout = masked.mean(estimated_kl(learn.old, moved, "k3"), mask, axis=-1)
+        # without a reason to select, the plain mean: the selecting one rounds otherwise
+        return masked.mean(by_rollout, jnp.any(mask, -1)) if algorithm.mask_truncated else jnp.mean(by_rollout)
 
     def too_long(carry: tuple[Array, Array, Array]) -> Array:
         _, kl, measured = carry

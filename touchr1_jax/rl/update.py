@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.rl.config import GRPOConfig, ratio_to_learner
@@ -121,13 +121,14 @@ def bucketed_gradient(
     first: bool | Bool[Array, ""] = True,
     longest: int | Float[Array, ""] | None = None,
 ) -> Gradient:
-    """`grpo_gradient` over as many tokens as the shortest sufficient bucket has."""
+    """`grpo_gradient` over as many tokens as the shortest bucket has that holds rollouts, levels and answers."""
     lengths = (*config.buckets, config.length)
 
     def over(length: int) -> Callable[[Params], Gradient]:
         cut = lambda x: x[..., :length]
-        rollout, by_token = jax.tree.map(cut, (learn.rollout, learn.token_advantage))
-        short = learn._replace(rollout=rollout, old=cut(learn.old), token_advantage=by_token)
+        rollout, by_token, answer = jax.tree.map(cut, (learn.rollout, learn.token_advantage, _answers(learn)))
+        batch = dataclasses.replace(learn.batch, **answer)
+        short = learn._replace(batch=batch, rollout=rollout, old=cut(learn.old), token_advantage=by_token)
 
         def of(params: Params) -> Gradient:
             grads, parts, old = grpo_gradient(fns, config, params, reference, short, first=first, longest=longest)
@@ -137,6 +138,23 @@ def bucketed_gradient(
 
     if len(lengths) == 1:
         return over(config.length)(params)
-    tokens = jnp.max(jnp.sum(learn.rollout.mask, -1))
-    bucket = jnp.sum(jnp.asarray(lengths) < tokens)
+    bucket = jnp.sum(jnp.asarray(lengths) < _longest(config, learn))
     return jax.lax.switch(bucket, [over(length) for length in lengths], params)
+
+
+def _answers(learn: Experience) -> dict[str, Array]:
+    """The verified answers of a batch by the names of its fields; none without an anchor."""
+    return {} if learn.batch.answer is None else {n: getattr(learn.batch, n) for n in ("answer", "answer_mask")}
+
+
+def _longest(config: GRPOConfig, learn: Experience) -> Int[Array, ""]:
+    """Most tokens that count of a rollout, up to its level where it is enumerated, or of an answer.
+
+    A rollout that is cut off may be masked, and its level has a part in the advantages of the others all the same.
+    """
+    counts = [jnp.max(jnp.sum(learn.rollout.mask, -1))]
+    if learn.levels is not None:
+        counts.append(jnp.max(jnp.where(learn.levels.at < config.length, learn.levels.at + 1, 0)))
+    if learn.batch.answer_mask is not None:
+        counts.append(jnp.max(jnp.sum(learn.batch.answer_mask, -1)))
+    return jnp.max(jnp.stack(counts))

@@ -50,7 +50,13 @@ class EncoderTrainingConfig:
 
 
 def train_encoder(
-    policy: TouchPolicy, params: Params, batches: Batches, config: EncoderTrainingConfig, hooks: Hooks = SILENT
+    policy: TouchPolicy,
+    params: Params,
+    batches: Batches,
+    config: EncoderTrainingConfig,
+    hooks: Hooks = SILENT,
+    *,
+    seed: int = 0,
 ) -> Params:
     """Train everything of a policy but its decoder and its frozen towers; the head is not kept.
 
@@ -60,6 +66,7 @@ def train_encoder(
       batches: `TouchBatch`es with labels, −1 where one is unknown, for example of `touch_rows`.
       config: steps and optimizer.
       hooks: log, checkpoints, devices.
+      seed: of the sensors that are shown.
     """
     kept = {name: tree for name, tree in params.items() if name in ("decoder", *policy.frozen)}
     encoders = jax.tree.map(jnp.copy, {name: tree for name, tree in params.items() if name not in kept})
@@ -68,7 +75,8 @@ def train_encoder(
     trained = {"encoders": encoders, "head": {"kernel": jnp.zeros((width, outputs)), "bias": jnp.zeros(outputs)}}
     optimizer, step = encoder_program(policy, config)
     state = FineTuneState(params=trained, opt_state=optimizer.init(trained), step=jnp.zeros((), jnp.int32))
-    step, state, batches = hooks.devices.shard(step, state, batches, config.batch_size, kept)
+    constants = kept, jnp.uint32(seed)
+    step, state, batches = hooks.devices.shard(step, state, batches, config.batch_size, *constants)
     state = fit(step, state, batches, LoopConfig(steps=config.steps, save_every=config.save_every), hooks)
     return kept | hooks.devices.gather(state.params)["encoders"]
 
@@ -77,11 +85,15 @@ def train_encoder(
 def encoder_program(
     policy: TouchPolicy, config: EncoderTrainingConfig
 ) -> tuple[optax.GradientTransformation, Callable[..., tuple[FineTuneState, dict[str, Array]]]]:
-    """Optimizer and compiled step, (state, batch, frozen towers) → (state, metrics), made once for all seeds."""
+    """Optimizer and compiled step, (state, batch, frozen towers, seed) → (state, metrics), made once for all seeds."""
     optimizer = make_optimizer(config.optimizer, config.steps)
 
-    def step(state: FineTuneState, batch: TouchBatch, kept: Params) -> tuple[FineTuneState, dict[str, Array]]:
-        shown = some_streams(jax.random.key(state.step), batch.stream_mask)
+    def step(
+        state: FineTuneState, batch: TouchBatch, kept: Params, seed: Array
+    ) -> tuple[FineTuneState, dict[str, Array]]:
+        # (seed, step) as the two words of a key; those of seed 0 are those of key(step)
+        key = jax.random.wrap_key_data(jnp.stack([seed, state.step.astype(jnp.uint32)]), impl="threefry2x32")
+        shown = some_streams(key, batch.stream_mask)
         known = jnp.maximum(jnp.sum(batch.label >= 0), 1)
 
         def share(params: Params, part: tuple[TouchBatch, Array]) -> tuple[Array, Array]:

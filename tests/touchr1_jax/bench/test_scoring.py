@@ -1,5 +1,6 @@
 """From answers to the table of the bench, and its averages, by hand values."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -49,6 +50,14 @@ def test_values_know_their_objects():
     assert clusters(ASKS, table["sfd"]).tolist() == ["a", "a"]  # both orders of a pair are one object's
     assert clusters(ASKS, table["deceptive_acc"]).tolist() == ["c"]
     assert clusters(ASKS, table["omae"]).tolist() == ["a", "b", "a", "a"]
+
+
+def test_sensors_of_different_touches_are_no_group():
+    """Without a group of their own two touches would count as one, against the answer of the first."""
+    one = next(ask for ask in ASKS if ask.kind == "one_sensor")
+    other = dataclasses.replace(one, id="other", answer=(one.answer[0] + 1,))
+    with pytest.raises(ValueError, match=f"holds {one.id!r} and 'other': must be of one touch and property"):
+        score((*ASKS, other), RIGHT | {"other": other.answer})
 
 
 def test_conflict_is_where_sight_is_wrong():

@@ -191,6 +191,19 @@ def test_a_reference_without_error_is_refused():
         skill(np.ones(2), np.zeros(2), np.arange(2))
 
 
+def test_one_object_has_neither_an_interval_of_skill_nor_a_crossed_test():
+    with pytest.raises(ValueError, match="objects holds 1: an interval over objects needs two"):
+        skill(np.ones(3), np.full(3, 2.0), np.zeros(3, int))
+    with pytest.raises(ValueError, match="objects holds 1"):
+        statistics.crossed_test(np.ones((5, 3)), np.zeros(3, int))
+
+
+def test_resamples_of_objects_without_reference_error_are_left_out():
+    """An eighth of the resamples of three objects holds none but the two that have no reference error."""
+    found = skill(np.array([1.0, 0.0, 0.0]), np.array([2.0, 0.0, 0.0]), np.arange(3))
+    assert (found.low, found.mean, found.high) == (0.5, 0.5, 0.5)
+
+
 @pytest.mark.parametrize(
     ("low", "high", "excludes"), [(0.0, 1.0, False), (-1.0, 0.0, False), (1e-9, 1.0, True), (-1.0, -1e-9, True)]
 )

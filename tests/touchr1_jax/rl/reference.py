@@ -105,6 +105,16 @@ def nucleus(p: Float, top_p: float, min_p: float) -> NDArray[np.bool_]:
     return kept
 
 
+def drawn(config, log, still, tokens) -> Float:
+    """Log-probability of each token among those that may be drawn by the distribution `still`."""
+    value = of_tokens(log, tokens)
+    for at in np.ndindex(tokens.shape) if config.top_p < 1 or config.min_p > 0 else ():
+        kept = nucleus(np.exp(still[at]), config.top_p, config.min_p)
+        kept[tokens[at]] = True
+        value[at] -= np.log(np.exp(log[at][kept]).sum())
+    return value
+
+
 def drift(algorithm, log_p, still, fixed) -> Float:
     """What score centering subtracts at advantage 1, token by token, 0 without it; `still` has no gradient."""
     found, cap = np.zeros(fixed["tokens"].shape), algorithm.importance_cap or np.inf
@@ -116,6 +126,29 @@ def drift(algorithm, log_p, still, fixed) -> Float:
             w = np.minimum(p[head] / q, cap), min(1 / tail, cap)
         found[at] = ((q * w[0] - tail * w[1] * p[head]) * log_p[at][head]).sum()
     return found
+
+
+def concluded(a, log_p, still, fixed) -> tuple[Float, Float, Float]:
+    """E_i / n with gradient, the same without, and A_i of the trace, [P, G], where conclusions are enumerated."""
+
+    def outcomes(log, i, j):
+        """Probability of each level, and what it earns."""
+        at, ids = fixed["at"][i, j], fixed["ids"][i][fixed["ids"][i] >= 0]
+        if at == log.shape[-2]:
+            return np.ones(1), fixed["sampled"][i, j : j + 1]
+        return np.exp(log[i, j, at, ids]), fixed["earns"][i, j, : len(ids)]
+
+    def spread(i, j):
+        q, r = outcomes(still, i, j)
+        return q @ (r - mean[i, 0]) ** 2 + (1 - q.sum()) * mean[i, 0] ** 2
+
+    p, g = fixed["at"].shape
+    each = lambda of: np.array([[of(i, j) for j in range(g)] for i in range(p)])
+    value, now = (each(lambda i, j, log=log: np.dot(*outcomes(log, i, j))) for log in (log_p, still))
+    mean = now.mean(1, keepdims=True)
+    sigma = np.sqrt(each(spread).mean(1, keepdims=True)) + a.epsilon
+    n = {"none": 1.0, "std": sigma, "mean": np.maximum(mean, 0.02)}[a.enumerated.value]
+    return value / n, now / n, (now - (now.sum(1, keepdims=True) - now) / (g - 1)) / n
 
 
 def objective(config, own, perturbed, fixed, *, first: bool) -> float:
@@ -130,29 +163,25 @@ def objective(config, own, perturbed, fixed, *, first: bool) -> float:
         for x in (own, perturbed, fixed["reference"], fixed["own"], fixed["perturbed"])
     )
 
-    def drawn(log):
-        value = of_tokens(log, tokens)
-        if config.top_p == 1 and config.min_p == 0:
-            return value
-        for at in np.ndindex(tokens.shape):
-            kept = nucleus(np.exp(still[at]), config.top_p, config.min_p)
-            kept[tokens[at]] = True
-            value[at] -= np.log(np.exp(log[at][kept]).sum())
-        return value
-
-    here, then = drawn(log_p), drawn(still)
+    here, then = (drawn(config, log, still, tokens) for log in (log_p, still))
     old = then if first else fixed["old"]
-    log_c = old - fixed["sampler"]
-    if a.importance_sequence:
-        log_c = np.broadcast_to((log_c * mask).sum(-1, keepdims=True), log_c.shape)
-    c = 1.0 if a.importance_cap is None else np.minimum(np.exp(log_c), a.importance_cap)
+    log_c, drawn_length = old - fixed["sampler"], mask.sum(-1)
     if a.mismatch_limit is not None:
-        far = (np.abs(old - fixed["sampler"]) * mask).sum(-1) / mask.sum(-1) > a.mismatch_limit
+        far = (np.abs(log_c) * mask).sum(-1) / drawn_length > a.mismatch_limit
         mask = mask & ~far[..., None]
-    advantage, length = fixed["advantage"][..., None], np.maximum(mask.sum(-1), 1)
+    length, advantage, trace = np.maximum(mask.sum(-1), 1), fixed["advantage"], mask
+    advantage = advantage if advantage.ndim == mask.ndim else advantage[..., None]
+    if a.enumerated is not None:
+        exact, fixed_exact, of_trace = concluded(a, log_p, still, fixed)
+        place, at, advantage = np.arange(mask.shape[-1]), fixed["at"][..., None], of_trace[..., None]
+        trace = mask & (place < at)
+    if a.importance_sequence:
+        log_c = np.broadcast_to((log_c * trace).sum(-1, keepdims=True), log_c.shape)
+    c = np.ones_like(here) if a.importance_cap is None else np.minimum(np.exp(log_c), a.importance_cap)
     ratio, low, high = np.exp(here - old), 1 - a.clip_low, 1 + a.clip_high
     if a.surrogate.value == "sequence":
-        ratio = np.exp(((here - old) * mask).sum(-1, keepdims=True) / length[..., None]) * np.ones_like(here)
+        mean = ((here - old) * trace).sum(-1, keepdims=True) / np.maximum(trace.sum(-1, keepdims=True), 1)
+        ratio = np.exp(mean) * np.ones_like(here)
     policy = np.minimum(ratio * advantage, np.clip(ratio, low, high) * advantage)
     if a.surrogate.value == "cispo":
         policy = np.clip(np.exp(then - old), low, high) * advantage * here
@@ -160,14 +189,18 @@ def objective(config, own, perturbed, fixed, *, first: bool) -> float:
     log_r = of_tokens(log_ref, tokens) - of_tokens(log_p, tokens)
     p = np.exp(log_p)
     kl = {"k1": -log_r, "k2": log_r**2 / 2, "k3": np.exp(log_r) - 1 - log_r, "exact": (p * (log_p - log_ref)).sum(-1)}
+    if a.enumerated is not None:
+        weight = c[..., :1] if a.importance_sequence else 1.0
+        level = weight * exact[..., None] if a.learn_conclusion else fixed_exact[..., None] - kl[a.kl]
+        policy = np.where(place < at, policy, np.where(place == at, level, 0.0))
     grounding = (p * (log_p - (still_q if a.grounding_stop_masked else log_q))).sum(-1)
     grounding = np.minimum(grounding, a.grounding_cap_nat or np.inf)
     sums = lambda x: (x * mask).sum(-1)
     per_rollout = lambda x: (sums(x) / length).mean(-1)
     average = {
         "rollout": per_rollout,
-        "token": lambda x: sums(x).sum(-1) / length.sum(-1),
-        "batch": lambda x: sums(x).mean(-1) / length.mean(),
+        "token": lambda x: sums(x).sum(-1) / np.maximum(mask.sum((-2, -1)), 1),
+        "batch": lambda x: sums(x).mean(-1) / drawn_length.mean(),
         "length": lambda x: sums(x).mean(-1) / config.length,
     }[a.average.value]
     gain = (fixed["weight"] * average(policy)).sum()

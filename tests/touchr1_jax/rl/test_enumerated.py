@@ -148,6 +148,33 @@ def test_mean_gradient_over_all_groups_is_that_of_the_expected_reward(algorithm)
         np.testing.assert_allclose(found, exact, atol=2e-6)
 
 
+SAMPLER = np.array([-0.4, 0.6])  # logits of the traces under a sampler that differs, as do its levels
+
+
+@pytest.mark.parametrize("norm_of", [Average.LENGTH, Average.ROLLOUT])
+def test_weights_of_rollouts_make_up_for_a_sampler_that_draws_other_traces(norm_of):
+    """Groups by the sampler's probability, the level of a rollout at its own: the gradient is still the policy's."""
+    algorithm = Rloo(enumerated=Norm.NONE, average=norm_of, importance_cap=1e6, importance_sequence=True)
+    config = GRPOConfig(prompts=1, micro_prompts=1, group=2, length=2, algorithm=algorithm)
+    log_q = np.log(np.stack([softmax(SAMPLER), [0.1, 0.7]], -1))  # of a trace, and of the level that was drawn after it
+
+    def loss(level_logits, drawn):
+        log_trace, log_level = jax.nn.log_softmax(jnp.asarray(TRACE)), jax.nn.log_softmax(level_logits)
+        log_prob = jnp.stack([log_trace[drawn], log_level[drawn, 0]], -1)[None]
+        nothing = jnp.zeros_like(log_prob)
+        found = TokenTerms(log_prob, nothing, nothing, nothing, log_level[drawn][None])
+        earns, at = jnp.asarray(EARNS)[drawn][None], jnp.ones((1, 2), int)
+        levels = LevelRewards(ids=jnp.arange(3)[None], at=at, reward=earns, sampled=nothing[..., 0])
+        arrays = jax.lax.stop_gradient(log_prob), jnp.asarray(log_q, jnp.float32)[drawn][None]
+        rest = jnp.ones((1, 2, 2), bool), jnp.full((1, 2), jnp.nan), jnp.ones(1)
+        return grpo_loss(found, *arrays, *rest, config, levels=levels)[0]
+
+    grad, total = jax.jit(jax.grad(loss)), np.zeros((2, 3))
+    for pair in itertools.product(range(2), repeat=2):
+        total -= config.length * np.prod(softmax(SAMPLER)[list(pair)]) * np.asarray(grad(LEVEL, np.array(pair)), float)
+    np.testing.assert_allclose(total, true_gradient()[1], atol=2e-6)
+
+
 def test_the_conclusion_begins_after_its_only_tag():
     tokens = jnp.array([[5, 7, 1, 2], [5, 1, 2, 7], [5, 1, 2, 3], [7, 1, 7, 2]])
     np.testing.assert_array_equal(conclusion_place(tokens, 7), [2, 4, 4, 4])

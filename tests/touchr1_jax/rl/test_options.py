@@ -11,7 +11,8 @@ import pytest
 
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.rl.test_grpo import FNS, FROZEN, P, score
-from touchr1_jax.rl.config import Average, GRPOConfig, Gspo, Paper
+from touchr1_jax.rl.config import Advantage, Average, GRPOConfig, Gspo, Norm, Paper, ReinforcePlusPlus, Rloo
+from touchr1_jax.rl.enumerated import LevelRewards
 from touchr1_jax.rl.gradient import Experience, log_probs
 from touchr1_jax.rl.grpo import make_grpo_step, start_state
 from touchr1_jax.rl.losses import over_tokens
@@ -205,6 +206,27 @@ def test_a_bucket_holds_the_longest_rollout(learn):
         close(old[mask], before[mask], rtol=1e-6)
 
 
+ANCHORED = {"algorithm": Paper(beta=0.0, gamma=0.0, anchor=0.5)}
+CONCLUDED = {"algorithm": Rloo(enumerated=Norm.NONE)}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("change", [ANCHORED, CONCLUDED], ids=["an answer", "the level of a masked rollout"])
+def test_a_bucket_holds_all_that_the_loss_reads(learn, change):
+    """Rollouts of two tokens fit into the bucket; the answer, or the level of a rollout that is cut off, does not."""
+    mask = jnp.broadcast_to(jnp.arange(T) < 2, (P, G, T)).at[0, 0].set(False)
+    answer = {"answer": learn.rollout.tokens[:, 0], "answer_mask": jnp.ones((P, T), bool)}
+    batch = BATCH.replace(**answer) if change is ANCHORED else BATCH
+    at, reward = jnp.ones((P, G), int).at[0, 0].set(T - 1), jnp.tile(jnp.array([1.0, 0.5]), (P, G, 1))
+    levels = LevelRewards(ids=jnp.tile(jnp.array([3, 5]), (P, 1)), at=at, reward=reward, sampled=jnp.zeros((P, G)))
+    masked = learn._replace(
+        batch=batch, rollout=learn.rollout.replace(mask=mask), levels=levels if change is CONCLUDED else None
+    )
+    whole, cut = (dataclasses.replace(CONFIG, **change, buckets=buckets) for buckets in ((), (2,)))
+    gradient = lambda config: jax.jit(lambda e: bucketed_gradient(FNS, config, START, START, e)[0])(masked)
+    close(gradient(cut), gradient(whole), rtol=1e-4, atol=1e-6)
+
+
 @pytest.mark.long
 def test_parts_of_several_updates_are_those_of_the_first(learn):
     """But the share of clipped tokens is that of the last, which is off policy at a large rate."""
@@ -326,6 +348,7 @@ def test_metrics_of_minibatches_count_prompts_and_weigh_streams_by_them():
         ({"reference_share": 0.0, "reference_every": 2}, "reference_share is 0.0: must lie in 0 < share ≤ 1"),
         ({"reference_share": 0.5}, "reference_share is 0.5, but reference_every is None: set it"),
         ({"importance_sequence": True}, "importance_sequence is True, but importance_cap is None: set it"),
+        ({"kl_in_reward": True, "advantage": Advantage.PER_REWARD}, "kl_in_reward is True: must be False for PER_REW"),
     ],
 )
 def test_bad_options_are_named(change, message):
@@ -339,6 +362,7 @@ def test_bad_options_are_named(change, message):
         ({"temperature": 0.0}, "temperature is 0.0"),
         ({"top_p": 0.0}, "top_p is 0.0"),
         ({"min_p": 1.5}, "min_p is 1.5"),
+        ({"group": 1, "algorithm": ReinforcePlusPlus(enumerated=Norm.NONE)}, "group is 1: must be at least 2"),
         ({"algorithm": Paper(minibatches=3)}, "micro_prompts 4 of each of 3 minibatches must divide prompts 8"),
     ],
 )

@@ -1,5 +1,7 @@
 """An update that is too long is shortened to its bound; a short one stays as it is."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -77,6 +79,30 @@ def test_an_update_without_a_finite_kl_is_left_out(shorten):
     assert size["update_scale"] == 0
     for a, b in zip(*map(jax.tree.leaves, (params, BEFORE)), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.long
+def test_an_update_to_parameters_that_are_not_finite_is_left_out(learn):
+    after = jax.tree.map(lambda a: jnp.full_like(a, jnp.inf), BEFORE)
+    params, size = jax.jit(lambda after: within_trust(FNS, CONFIG, BEFORE, after, learn, DELTA))(after)
+    assert size["update_scale"] == 0
+    jax.tree.map(np.testing.assert_array_equal, params, BEFORE)
+
+
+@pytest.mark.long
+def test_rollouts_that_are_masked_do_not_make_an_update_look_shorter(learn):
+    """Without the rollouts of one prompt the KL is that of the others, not less."""
+    there = (jnp.arange(P) > 0)[:, None, None]
+    after = jax.tree.map(lambda a, d: a + 0.05 * d, BEFORE, DIRECTION)
+    config = dataclasses.replace(CONFIG, algorithm=dataclasses.replace(CONFIG.algorithm, mask_truncated=True))
+
+    def kl(mask):
+        part = learn._replace(rollout=learn.rollout.replace(mask=mask))
+        return within_trust(FNS, config, BEFORE, after, part, 1e3)[1]["update_kl"]
+
+    measure, mask = jax.jit(kl), learn.rollout.mask
+    first, others, all_ = (measure(mask & x) for x in (~there, there, True))
+    np.testing.assert_allclose((first + (P - 1) * others) / P, all_, rtol=1e-4)
 
 
 @pytest.mark.parametrize(("kl", "stays"), [(1.3, True), (2.0, False)])

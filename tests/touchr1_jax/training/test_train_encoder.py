@@ -121,9 +121,10 @@ def test_the_gradient_of_micro_batches_is_that_of_the_batch():
 
     value, gradient = jax.jit(jax.value_and_grad(whole))(trained)
     state = FineTuneState(params=trained, opt_state=optimizer.init(trained), step=jnp.zeros((), jnp.int32))
-    metrics = step(tiny.copy(state), touch, kept)[1]
+    metrics, other = (step(tiny.copy(state), touch, kept, jnp.uint32(seed))[1] for seed in (0, 1))
     np.testing.assert_allclose(metrics["loss"], value, rtol=1e-5)
     np.testing.assert_allclose(metrics["grad_norm"], optax.tree.norm(gradient), rtol=1e-5)
+    assert abs(other["loss"] - value) > 1e-3  # another seed shows other sensors
 
 
 def test_half_of_the_contacts_show_a_part_of_their_sensors():
