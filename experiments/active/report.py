@@ -11,6 +11,7 @@ from experiments.active.plans import Played
 from experiments.core.charts import Panel, Series, draw
 from experiments.core.pictures import Heatmap, heatmaps, image_grid
 from experiments.core.results import Cell, Picture, Table, named_table
+from experiments.study.estimates import RESAMPLES
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
 from touchr1_jax.text.language import EXPLORED_ATTRIBUTES
 from touchr1_jax.training.exploration import NO_CHOICE
@@ -31,8 +32,6 @@ MOTION_OF: Mapping[str, tuple[str, ...]] = {
     "contour following, enclosure": ("roll", "twist"),
 }
 """Motions of the protocol that are most like a procedure."""
-
-RESAMPLES = 2000
 
 
 def headroom_table(found: Mapping[tuple[str, int], Float[np.ndarray, "O A"]], source: str) -> Table:
@@ -152,9 +151,8 @@ def found_motion(contacts: ContactsConfig, first: Int[np.ndarray, "n"], beliefs:
     per_sensor, per_motion = len(contacts.motions) * len(contacts.forces_n), len(contacts.forces_n)
     motion = np.bincount(touched % per_sensor // per_motion, minlength=len(contacts.motions)).argmax()
     right = single(beliefs, question)
-    best = clustered_bootstrap(
-        right[:, right.mean(0).argmax()].astype(float), np.arange(len(right)), resamples=RESAMPLES
-    )
+    of_best = right[:, right.mean(0).argmax()].astype(float)
+    best = clustered_bootstrap(of_best, np.arange(len(right)), resamples=RESAMPLES)
     return bool(motion_accuracy(contacts, beliefs, question)[motion] >= best.low)
 
 

@@ -25,6 +25,7 @@ from experiments.core.errors import ConfigurationError
 from experiments.core.results import Picture, Table, named_table
 from experiments.recordings.cross_validation import deal_folds
 from experiments.recordings.descriptions import SENSOR, DescribedVideos, describe_source
+from experiments.study.estimates import RESAMPLES, points
 from sensors_io.touches import families
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
 from touchr1_jax.models.active_policy import build_active_policy
@@ -39,7 +40,6 @@ from touchr1_jax.training.optimizer import OptimizerConfig
 from touchr1_jax.training.train_sft import SFTConfig
 
 CHOSEN = "chosen"
-RESAMPLES = 2000
 
 READERS = KernelProbeConfig(families=tuple(dict.fromkeys(families())))
 
@@ -226,8 +226,7 @@ def equal_videos(played: Mapping[str, Played], one: Played, videos: int) -> Inte
     below = min(int(number), videos - 1)
     share = number - below
     fixed = (1 - share) * played[f"{below} videos"].right + share * played[f"{below + 1} videos"].right
-    difference = 100 * (one.right - fixed).mean(1)
-    return clustered_bootstrap(difference, np.arange(len(difference)), resamples=RESAMPLES)
+    return points((one.right - fixed).mean(1), np.arange(len(fixed)))
 
 
 def video_table(world: VideoWorld, played: Mapping[str, Played]) -> Table:

@@ -32,13 +32,13 @@ from experiments.encoder.pretrain import (
     clip_of,
     held_out_contacts,
     open_touch,
-    points,
     pretrain,
     probe_encoder,
 )
 from experiments.encoder.speed import CompiledProgram, forward, matrix_product, medians, parts
 from experiments.encoder.variants import FRAMES, IMAGE_PX, REFERENCE, EncoderVariant, FieldsOnly, variants
 from experiments.study.dataset import Dataset
+from experiments.study.estimates import points
 from sensors_io.pipeline import clip_batches
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.bench.metrics import ORDINAL

@@ -19,7 +19,6 @@ from sensors_io.pipeline import ClipConfig, ClipMemory, Contacts, clip_batches
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import ATTRIBUTES, Flag
 from touchr1_jax.bench.metrics import ORDINAL
-from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
 from touchr1_jax.training import pretraining
 from touchr1_jax.training.dynamics import (
     DynamicsConfig,
@@ -38,9 +37,6 @@ from touchr1_jax.types import Params, TouchBatch
 
 BATCH = 32
 """Contacts that are encoded at once."""
-
-RESAMPLES = 2000
-"""Resamples of each interval: the error of its ends is about a tenth of its width."""
 
 STAGE_ONE_SEED = 1
 """Seed of the scenes of stage 1: its objects differ from those of seed 0, on which later stages train and test."""
@@ -153,12 +149,6 @@ def probe_encoder(networks: DynamicsConfig, encoder: Params, held_out: HeldOutCo
         return {"latent": encode_each(networks.encoder, encoder, batch), "exists": exists}
 
     return held_out.probe_right(**held_out.encode(jax.jit(encode), context))
-
-
-def points(values: np.ndarray, objects: np.ndarray) -> Interval:
-    """Mean in points of values [n] or [n, A] of n contacts, with an interval over objects [n]."""
-    clusters = np.repeat(objects, values[0].size)
-    return clustered_bootstrap(100.0 * values.astype(float).ravel(), clusters, resamples=RESAMPLES)
 
 
 DEPTH_MEASURES = 3

@@ -34,10 +34,10 @@ from experiments.encoder.pretrain import (
     clip_of,
     held_out_contacts,
     open_touch,
-    points,
     pretrain,
     untrained,
 )
+from experiments.study.estimates import points
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.bench.metrics import ORDINAL
 from touchr1_jax.bench.statistics import skill

@@ -36,12 +36,12 @@ from experiments.encoder.pretrain import (
     StageOneDataConfig,
     clip_of,
     open_touch,
-    points,
     pretrain,
     read_all,
     untrained,
 )
 from experiments.study.dataset import Dataset
+from experiments.study.estimates import points
 from sensors_io.pipeline import clip_batches
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax import validation

@@ -110,7 +110,8 @@ def sft_step(config: QwenConfig, shape: StepShape) -> tuple[Any, tuple[Any, ...]
     ids, mask = np.zeros(length, np.int32), np.ones(length, bool)
     fresh = lambda batch: init_policy(module, jax.random.key(0), batch, ids, mask, prompt.slots)
     params = dict(jax.eval_shape(fresh, touch))
-    base = {name: jax.tree.map(_half, params.pop(name)) for name in ("vision", "decoder")}
+    half = lambda x: jax.ShapeDtypeStruct(x.shape, jnp.bfloat16)
+    base = {name: jax.tree.map(half, params.pop(name)) for name in ("vision", "decoder")}
     params[ADAPTERS] = jax.eval_shape(lambda p: init_adapters(jax.random.key(0), p, shape.lora), base)
     base = jax.eval_shape(quantised, base) if shape.model.four_bits else base
     optimizer = make_optimizer(OptimizerConfig(learning_rate=1e-5), 10)
@@ -143,10 +144,6 @@ def _module(config: QwenConfig, shape: StepShape) -> Any:
     tactile = dataclasses.replace(shape.model.tactile, sensors=len(SENSORS))
     budget = RELEASED_BUDGETS[config.vision.model_type]
     return qwen_policy(config, tactile, (shape.model.view_px, shape.model.view_px), budget)
-
-
-def _half(x: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
-    return jax.ShapeDtypeStruct(x.shape, jnp.bfloat16)
 
 
 def drawn(shapes: Any) -> Any:

@@ -3,10 +3,9 @@
     python -m experiments step_weights [--scale smoke] [--size 3B|Qwen3-VL-4B] [--run]
 
 Compiles one step of SFT, end to end through the vision tower, and one of GRPO, both of adapters on frozen weights in
-bfloat16, at a released shape without weights, and reads the memory that the compiler reserves.  Decoder and vision
-tower are loops over stacked layers, so that a program does not grow with depth; the same steps of a decoder of
-`shallow` layers measure the growth of compilation time.  `--run` also runs both steps with random weights in a separate
-process and measures its largest resident size.
+bfloat16, at a released shape without weights, and reads the memory that the compiler reserves; also with `shallow`
+layers, since loops over stacked layers should compile as fast at any depth.  `--run` also runs both steps with random
+weights in a separate process and measures its largest resident size.
 
 Cost: two to five minutes of one core for the 3B; with `--run`, 1.5 times the memory of the weights.
 
@@ -129,13 +128,13 @@ MEANINGS = {
 
 def table(rows: list[dict[str, Any]]) -> Table:
     """Every step."""
-    named = [name for name in MEANINGS if any(name in row for row in rows)]
+    named = {name: why for name, why in MEANINGS.items() if any(name in row for row in rows)}
     seconds = {"tracing", "compiling", "elapsed", "first", "second"}
     return named_table(
         "Steps of adapters on frozen weights",
         rows,
         units={name: "s" if name in seconds else "GB" for name in named},
-        meanings={name: MEANINGS[name] for name in named},
+        meanings=named,
         note=f"Compiled for {jax.default_backend()}.",
     )
 

@@ -11,13 +11,9 @@ from jaxtyping import Float, Int
 from experiments.core.concurrency import in_threads
 from experiments.mechanics.identify_features import ContactData
 from sensors_io.schema import SENSORS
-from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
 from touchr1_jax.training.linear_probe import ProbeConfig, group_folds, probe_log_probs
 
 LEVELS = 3
-
-RESAMPLES = 2000
-"""Bootstrap resamples of each interval: its ends are then good to a tenth of its width."""
 
 STATIC = ("hardness", "roughness", "protrusion")
 """Properties that a press determines."""
@@ -80,12 +76,6 @@ def transfer(
     found = probe_log_probs(np.concatenate([train, *tests]), np.tile(labels, copies), weights, LEVELS, config)
     blocks = found.reshape(config.folds, copies, len(fold), LEVELS)
     return [ProbePredictions(blocks[fold, copy, np.arange(len(fold))], labels) for copy in range(copies)]
-
-
-def points(values: np.ndarray, objects: np.ndarray) -> Interval:
-    """Mean of values [n] or [n, S] in points, with the interval over objects [n]."""
-    clusters = np.repeat(objects, values[0].size)
-    return clustered_bootstrap(100 * values.ravel(), clusters, resamples=RESAMPLES)
 
 
 def answers(

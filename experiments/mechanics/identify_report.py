@@ -22,8 +22,8 @@ from experiments.mechanics.identify_probes import (
     SOURCES,
     STATIC,
     Answers,
-    points,
 )
+from experiments.study.estimates import points
 from sensors_io.schema import SENSORS
 from touchr1_jax.bench.statistics import Interval
 

@@ -26,6 +26,12 @@ def object_interval(values: np.ndarray, objects: np.ndarray, spec: str = ".1f") 
     return interval(statistics.clustered_bootstrap(values.astype(float), objects, resamples=RESAMPLES // 2), spec)
 
 
+def points(values: np.ndarray, objects: np.ndarray) -> statistics.Interval:
+    """Mean in points of values [n] or [n, A] of n contacts, with an interval over objects [n]."""
+    clusters = np.repeat(objects, values[0].size)
+    return statistics.clustered_bootstrap(100.0 * values.astype(float).ravel(), clusters, resamples=RESAMPLES)
+
+
 def change(c: Comparison) -> str:
     """The difference in a metric, by its title and with its interval: `CSC −0.8 points [−1.2, −0.4]`."""
     metric = REPORTED[c.metric]
