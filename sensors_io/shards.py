@@ -1,6 +1,7 @@
 """ArrayRecord files as the data set uses them: written under a temporary name, read at random through one numbering."""
 
 import collections
+import contextlib
 import os
 import pathlib
 import threading
@@ -33,17 +34,24 @@ class ShardWriter:
     def __init__(self, root: pathlib.Path, kind: str, number: int):
         self._number, self._path = number, root / shard_file(kind, number)
         self._temporary = root / f".{self._path.name}.{os.getpid()}.tmp"  # two workers may try the same
-        self._writer = ArrayRecordWriter(_name(self._temporary), _OPTIONS)
+        with self._writing():
+            self._writer = ArrayRecordWriter(_name(self._temporary), _OPTIONS)
         self._count = 0
 
     def write(self, data: bytes) -> None:
         """Append one entry."""
-        self._writer.write(data)
+        with self._writing():
+            self._writer.write(data)
         self._count += 1
 
     def publish(self) -> np.ndarray:
-        """Close, count, sync and rename the file; its row.  The writer reports no failure: counting finds it."""
-        self._writer.close()
+        """Close, count, sync and rename the file; its row.  The writer reports not every failure: counting finds it.
+
+        Raises:
+          RecordsError: not all of it reached the disk.
+        """
+        with self._writing():
+            self._writer.close()
         reader = ArrayRecordReader(_name(self._temporary))
         found = reader.num_records() if reader.ok() else 0
         reader.close()
@@ -53,6 +61,16 @@ class ShardWriter:
             os.fsync(file.fileno())
         self._temporary.replace(self._path)
         return np.array((self._number, found, self._path.stat().st_size), SHARD)
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except RuntimeError as error:
+            raise RecordsError(
+                f"{self._path} cannot be written ({error}): free some space, or make its folder writable; what was "
+                "published before is kept, and the same command goes on"
+            ) from error
 
 
 class Entries:
