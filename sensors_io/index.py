@@ -22,7 +22,7 @@ from typing import Any, Self
 import numpy as np
 
 from sensors_io.codec import CorruptRecordsError, RecordsError
-from sensors_io.errors import MALFORMED
+from sensors_io.errors import MALFORMED, of_system
 from sensors_io.json_files import seal, unseal
 from sensors_io.remote import Place, StoreError, local
 from sensors_io.schema import MOTIONS
@@ -129,7 +129,7 @@ class Index:
         try:
             return cls._old(tree) if tree["version"] in _OLD else cls._opened(root, tree)
         except (OSError, *MALFORMED) as error:
-            if isinstance(error, RecordsError):
+            if isinstance(error, RecordsError) or of_system(error):
                 raise
             raise CorruptRecordsError(
                 f"{root}/{INDEX} is damaged ({error!r}); delete {root} and write it again"

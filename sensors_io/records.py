@@ -31,7 +31,7 @@ from sensors_io.contents import Cards, PartWriter, convert
 from sensors_io.index import INDEX, Index, MissingIndexError, Part, RecordsMeta, RecordsVersionError, read_root
 from sensors_io.remote import at_url, place
 from sensors_io.schema import SPLITS, ContactKey, ObjectCard, SchemaError, Sequence
-from sensors_io.shards import Entries, ShardWriter, shard_file
+from sensors_io.shards import Entries, ShardWriter, array_record_name, shard_file
 from sensors_io.tables import ContactTable
 
 __all__ = [
@@ -88,6 +88,7 @@ class RecordWriter:
         self._root = pathlib.Path(path)
         if at_url(path):
             raise RecordsError(f"{path} is a URL: records are written to a folder, then `push` uploads them; name one")
+        array_record_name(self._root)  # before anything is recorded
         try:
             self._root.mkdir(parents=True, exist_ok=True)
         except (FileExistsError, NotADirectoryError) as error:
@@ -348,11 +349,14 @@ def write_lock(root: pathlib.Path) -> IO[str]:
     file = (root / ".lock").open("w")
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
+    except BlockingIOError as error:
         file.close()
         raise RecordsBusyError(
             f"{root} is being written by another process; wait for it or choose another path"
         ) from error
+    except OSError:  # of a file system without locks
+        file.close()
+        raise
     return file
 
 

@@ -2,6 +2,7 @@
 
 import collections
 import contextlib
+import errno
 import os
 import pathlib
 import threading
@@ -35,7 +36,7 @@ class ShardWriter:
         self._number, self._path = number, root / shard_file(kind, number)
         self._temporary = root / f".{self._path.name}.{os.getpid()}.tmp"  # two workers may try the same
         with self._writing():
-            self._writer = ArrayRecordWriter(_name(self._temporary), _OPTIONS)
+            self._writer = ArrayRecordWriter(array_record_name(self._temporary), _OPTIONS)
         self._count = 0
 
     def write(self, data: bytes) -> None:
@@ -52,7 +53,7 @@ class ShardWriter:
         """
         with self._writing():
             self._writer.close()
-        reader = ArrayRecordReader(_name(self._temporary))
+        reader = ArrayRecordReader(array_record_name(self._temporary))
         found = reader.num_records() if reader.ok() else 0
         reader.close()
         if found < self._count:
@@ -102,6 +103,8 @@ class Entries:
             return decode(self._source(shard)[place])
         except (RuntimeError, CorruptRecordsError) as error:
             file = f"{self._root}/{shard_file(self._kind, self._shards['number'][shard])}"
+            if os.strerror(errno.EMFILE) in str(error):
+                raise RecordsError(f"{file} cannot be opened ({error}): raise the limit of open files") from error
             raise CorruptRecordsError(
                 f"{file}, entry {place}: {error}; copy the file again from its source, or write the records again"
             ) from error
@@ -129,7 +132,7 @@ class Entries:
                 return self._open[shard]
         row = self._shards[shard]
         path = local(self._root, shard_file(self._kind, row["number"]), size=int(row["bytes"]))
-        spared = f"{_name(path)}[0:{row['entries']}]"  # the range spares opening it to count it
+        spared = f"{array_record_name(path)}[0:{row['entries']}]"  # the range spares opening it to count it
         source = ArrayRecordDataSource([spared])
         with self._lock:
             source = self._open.setdefault(shard, source)
@@ -150,7 +153,7 @@ def _check_size(path: pathlib.Path, bytes_: int) -> None:
         )
 
 
-def _name(path: pathlib.Path) -> str:
+def array_record_name(path: pathlib.Path) -> str:
     """The path as ArrayRecord takes it.
 
     Raises:

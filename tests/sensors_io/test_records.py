@@ -83,6 +83,7 @@ def test_a_folder_that_the_format_cannot_name_is_named(tmp_path, name):
     """ArrayRecord would end reading with a TypeError."""
     moved = tmp_path / name
     refused(RecordsError, "is no path that records can have", fakes.write, moved, 1)
+    assert not moved.exists()  # nothing is recorded that could not be stored
     fakes.write(tmp_path / "r", 1)
     shutil.copytree(tmp_path / "r", moved, dirs_exist_ok=True)
     refused(RecordsError, "rename its folder", lambda: RecordStore(moved).contact(0))

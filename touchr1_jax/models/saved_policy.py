@@ -138,7 +138,7 @@ def published(folder: Path, parts: Collection[str] = ()) -> Iterator[Path]:
     Raises:
       PolicyError: there is something else.
     """
-    folder = folder.resolve()
+    folder = Path(os.path.realpath(folder))  # `resolve` raises RuntimeError for links in a circle
     others = sorted(path.name for path in folder.glob("*") if path.name not in parts)
     if others or folder.is_file():
         held = f"it also holds {', '.join(others[:3])}, which would be lost" if others else "a file"
