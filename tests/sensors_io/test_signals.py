@@ -4,6 +4,7 @@ import signal
 
 import pytest
 
+from sensors_io.__main__ import main
 from sensors_io.commands.choices import stop_on_interrupt
 from sensors_io.signals import ENDING, Ended, end_as_interrupted, leave_interrupted, say
 
@@ -60,3 +61,12 @@ def test_words_that_nobody_reads_raise_nothing(monkeypatch, lost):
     for stream in (None, Gone()):
         monkeypatch.setattr("sys.stderr", stream)
         say("x")
+
+
+def test_help_that_cannot_be_printed_is_one_line(monkeypatch, capsys):
+    def full(*args, **options):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr("sensors_io.commands.console.OUT.print", full)
+    assert main(["--help"]) == 1
+    assert capsys.readouterr().err.startswith("OSError: No space left on device: let standard output and standard error")
