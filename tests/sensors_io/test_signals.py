@@ -69,4 +69,6 @@ def test_help_that_cannot_be_printed_is_one_line(monkeypatch, capsys):
 
     monkeypatch.setattr("sensors_io.commands.console.OUT.print", full)
     assert main(["--help"]) == 1
-    assert capsys.readouterr().err.startswith("OSError: No space left on device: let standard output and standard error")
+    assert capsys.readouterr().err.startswith(
+        "OSError: No space left on device: let standard output and standard error"
+    )
