@@ -1,10 +1,10 @@
 """`python -m experiments`: run, continue, list, start and compare experiments, ask trained policies."""
 
-import contextlib
 import multiprocessing
 import os
-import signal
 import sys
+
+from sensors_io.signals import end_as_interrupted, leave_interrupted, say
 
 SIGNALLED = 128
 """Exit statuses above it are those of a run that a signal stopped."""
@@ -25,16 +25,12 @@ def leave(status: int) -> None:
     sys.exit(status)
 
 
-def say(text: str) -> None:
-    """Print to standard error; nothing is imported for it."""
-    sys.stderr.write(f"{text}\n")
-
-
 def main() -> None:
     """Run the command line and end the process.
 
     A second or more goes by until all is imported, in which Ctrl-C is answered too.
     """
+    end_as_interrupted()
     arguments = sys.argv[1:]
     try:
         from experiments.core.commands import ASKING, SWEEP, run_command
@@ -54,12 +50,10 @@ def main() -> None:
             from experiments.core.runner import run  # JAX and charts, which only runs need
 
             status = run(arguments)
-    except KeyboardInterrupt:  # a run handles the signal itself
-        say("Stopped; nothing is half-written, and the same command can be run again.")
-        status = SIGNALLED + signal.SIGINT
+    except KeyboardInterrupt as error:  # a run handles the signal itself
+        status = leave_interrupted(error, "Stopped; nothing is half-written, and the same command can be run again.")
     except OSError as error:  # a folder that cannot be read or written, a full disk, a pipe that was closed
-        with contextlib.suppress(OSError):
-            say(f"{type(error).__name__}: {error}: correct the path, its permissions, or free some space")
+        say(f"{type(error).__name__}: {error}: correct the path, its permissions, or free some space")
         status = 1
     leave(status)
 

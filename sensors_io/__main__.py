@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from sensors_io.errors import UserError
+from sensors_io.signals import end_as_interrupted, leave_interrupted, say
 
 PROG = "python -m sensors_io"
 
@@ -44,16 +45,20 @@ PLUS = "+"
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run one command; known errors become one line on stderr and exit status 1, Ctrl-C, also during imports, 130.
+    """Run one command; known errors become one line on stderr and exit status 1, signals, also during imports, 128 + n.
 
     Args:
       args: the command line; None takes that of the process.
     """
     try:
         return _run(sys.argv[1:] if args is None else args)
-    except KeyboardInterrupt:
-        sys.stderr.write("interrupted: run the same command again to resume\n")
-        return 130
+    except KeyboardInterrupt as error:
+        return leave_interrupted(error, "interrupted: run the same command again to resume")
+    except OSError as error:  # of help or an error that cannot be printed
+        say(
+            f"{type(error).__name__}: {error}: let standard output and standard error lead to something that takes text"
+        )
+        return 1
 
 
 def _run(args: list[str]) -> int:
@@ -131,4 +136,5 @@ def _sections(args: list[str]) -> list[list[str]]:
 
 
 if __name__ == "__main__":
+    end_as_interrupted()
     sys.exit(main())

@@ -12,7 +12,7 @@ from typing import IO
 
 import numpy as np
 
-from sensors_io.errors import MALFORMED, UserError
+from sensors_io.errors import MALFORMED, UserError, of_system
 
 _BROKEN = (
     *MALFORMED, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error, lzma.LZMAError, tokenize.TokenError,
@@ -48,6 +48,8 @@ def load_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
                     found[member.filename.removesuffix(".npy")] = _array(file, member.file_size)
             return found
     except _BROKEN as error:
+        if of_system(error):
+            raise
         raise ArraysError(f"{path} cannot be read as arrays ({error}); copy it again from its source") from error
 
 

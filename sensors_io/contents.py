@@ -101,6 +101,17 @@ class Cards(Mapping[str, ObjectCard]):
         return card
 
 
+def convert(root: pathlib.Path, index: Index) -> bool:
+    """Give an index of version 1 or 2 its tables, which its next root states; True if it had none.
+
+    The old root is valid until then, and shards stay as they are.
+    """
+    if index.tables:
+        return False
+    index.convert(root, {name: card.split for name, card in Cards(root, index).items()})
+    return True
+
+
 def rest_pictures(root: Place) -> dict[str, bytes]:
     """Files with the gel at rest that lie beside records, by name.
 

@@ -1,5 +1,6 @@
 """Base class of all errors that are meant for a user, and those that foreign bytes raise."""
 
+import errno
 import os
 import struct
 
@@ -10,6 +11,13 @@ MALFORMED = (
 """Errors that Python and NumPy raise for bytes that another program wrote or a disk damaged; whoever reads such bytes
 names the file instead.  `SyntaxError` is NumPy's for the name of a type.
 """
+
+_OF_SYSTEM = {errno.EMFILE, errno.ENFILE, errno.EIO, errno.ENOMEM, errno.EACCES, errno.ESTALE, errno.ETIMEDOUT}
+
+
+def of_system(error: BaseException) -> bool:
+    """True of an error that says nothing about a file's bytes: it could not be read here and now."""
+    return isinstance(error, OSError) and error.errno in _OF_SYSTEM
 
 
 class UserError(Exception):

@@ -22,7 +22,7 @@ from typing import Any, Self
 import numpy as np
 
 from sensors_io.codec import CorruptRecordsError, RecordsError
-from sensors_io.errors import MALFORMED
+from sensors_io.errors import MALFORMED, of_system
 from sensors_io.json_files import seal, unseal
 from sensors_io.remote import Place, StoreError, local
 from sensors_io.schema import MOTIONS
@@ -129,7 +129,7 @@ class Index:
         try:
             return cls._old(tree) if tree["version"] in _OLD else cls._opened(root, tree)
         except (OSError, *MALFORMED) as error:
-            if isinstance(error, RecordsError):
+            if isinstance(error, RecordsError) or of_system(error):
                 raise
             raise CorruptRecordsError(
                 f"{root}/{INDEX} is damaged ({error!r}); delete {root} and write it again"
@@ -186,14 +186,13 @@ class Index:
     def convert(self, root: pathlib.Path, splits: Mapping[str, str]) -> None:
         """Write the tables of an index of an older version; the root is not replaced yet."""
         self.tables, self.splits = _no_tables(), [splits[name] for name in self.objects]
-        self._append(root, "contacts", self.contacts.rows.tobytes())
-        self._append(root, "contact-shards", self.contact_shards.tobytes())
+        self._append(root, {"contacts": self.contacts.rows, "contact-shards": self.contact_shards})
         self.add_objects(root, self.object_shards, dict(zip(self.objects, self.splits, strict=True)))
 
     def add_objects(self, root: pathlib.Path, shards: np.ndarray, splits: Mapping[str, str]) -> None:
         """Append objects, id → split, and the shards of their cards."""
-        self._append(root, "objects", "".join(f"{name} {split}\n" for name, split in splits.items()).encode())
-        self._append(root, "object-shards", shards.tobytes())
+        lines = "".join(f"{name} {split}\n" for name, split in splits.items())
+        self._append(root, {"objects": np.frombuffer(lines.encode(), _BYTES), "object-shards": shards})
 
     def replace_objects(self, root: pathlib.Path, shard: np.ndarray, splits: Mapping[str, str]) -> None:
         """Tables of objects under new names, of which one shard holds all cards."""
@@ -211,12 +210,13 @@ class Index:
           entry: number of its first entry.
         """
         first = itertools.accumulate((len(seen) for *_, seen in part.contacts), initial=entry)
-        self._append(root, "contacts", _rows(part.contacts, first, numbers, self.meta.sensors).tobytes())
-        self._append(root, "contact-shards", np.array(part.shard, SHARD).tobytes())
+        rows = _rows(part.contacts, first, numbers, self.meta.sensors)
+        self._append(root, {"contacts": rows, "contact-shards": np.array(part.shard, SHARD)})
         self.frames.update(part.frames)
 
-    def _append(self, root: pathlib.Path, name: str, data: bytes) -> None:
-        self.tables[name] = self.tables[name].append(root, data)
+    def _append(self, root: pathlib.Path, added: Mapping[str, np.ndarray]) -> None:
+        """Append to tables: to all of them, or to none if a signal or a full disk comes between."""
+        self.tables |= {name: self.tables[name].append(root, data.tobytes()) for name, data in added.items()}
 
     def write(self, root: pathlib.Path) -> None:
         """Replace the root in one step, which makes visible what was added."""
@@ -230,7 +230,7 @@ class Index:
             "tables": {name: dataclasses.asdict(table) for name, table in self.tables.items()},
         }
         temporary = root / f".{INDEX}.tmp"
-        with temporary.open("w") as file:
+        with temporary.open("w", encoding="utf-8") as file:
             file.write(seal(json.dumps(tree, separators=(",", ":"), allow_nan=False)))
             file.flush()
             os.fsync(file.fileno())

@@ -22,7 +22,7 @@ def write_json(path: pathlib.Path, tree: Mapping[str, Any]) -> None:
     """Replace a file by JSON in one step; its folder is made if need be, for what is written was measured."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.tmp")
-    with temporary.open("w") as file:
+    with temporary.open("w", encoding="utf-8") as file:
         file.write(seal(json.dumps(tree, indent=1, allow_nan=False)))
         file.flush()
         os.fsync(file.fileno())
@@ -48,7 +48,7 @@ def read_json(path: pathlib.Path) -> Any:
     Raises:
       OSError, ValueError: it cannot be read, or its checksum does not hold.
     """
-    return unseal(path.read_text())
+    return unseal(path.read_text(encoding="utf-8"))
 
 
 def seal(text: str) -> str:

@@ -40,6 +40,7 @@ def write_by_units(
     """
     kept = {f"{path.name.partition('.')[0]}.arrayrecord" for path in out.glob("*.part")}
     with RecordWriter(out, meta=meta, resume=True, kept=kept.__contains__) as writer:
+        writer.begin()
         report(writer.contacts_done)
         units = units_from(writer.contacts_done, writer.shards_done)
         waiting = collections.deque(part_path(out.absolute(), unit.name) for unit in units)

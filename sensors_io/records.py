@@ -19,7 +19,7 @@ import datetime
 import fcntl
 import os
 import pathlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from collections.abc import Sequence as Seq
 from types import TracebackType
 from typing import IO, Any, Self
@@ -27,11 +27,11 @@ from typing import IO, Any, Self
 import numpy as np
 
 from sensors_io.codec import CorruptRecordsError, RecordsError, decode_sequence, encode_card
-from sensors_io.contents import Cards, PartWriter
+from sensors_io.contents import Cards, PartWriter, convert
 from sensors_io.index import INDEX, Index, MissingIndexError, Part, RecordsMeta, RecordsVersionError, read_root
 from sensors_io.remote import at_url, place
 from sensors_io.schema import SPLITS, ContactKey, ObjectCard, SchemaError, Sequence
-from sensors_io.shards import Entries, ShardWriter, shard_file
+from sensors_io.shards import Entries, ShardWriter, array_record_name, shard_file
 from sensors_io.tables import ContactTable
 
 __all__ = [
@@ -88,12 +88,11 @@ class RecordWriter:
         self._root = pathlib.Path(path)
         if at_url(path):
             raise RecordsError(f"{path} is a URL: records are written to a folder, then `push` uploads them; name one")
+        array_record_name(self._root)  # before anything is recorded
         try:
             self._root.mkdir(parents=True, exist_ok=True)
         except (FileExistsError, NotADirectoryError) as error:
-            raise RecordsExistError(
-                f"{self._root} leads to a file: must be a directory; choose another path"
-            ) from error
+            raise RecordsExistError(f"{self._root} leads to a file: must be a folder; choose another path") from error
         self._per_shard = contacts_per_shard
         self._lock = write_lock(self._root)
         try:
@@ -107,6 +106,7 @@ class RecordWriter:
         self._added: dict[ContactKey, None] = {}
         self._cards: dict[str, tuple[str, bytes]] = {}
         self._part: PartWriter | None = None
+        self._placed: Part | None = None  # in its place, not in the index yet
 
     @property
     def contacts_done(self) -> int:
@@ -154,6 +154,8 @@ class RecordWriter:
         """
         if sequences:
             self._check_key(sequences[0].key)
+        if self._placed is not None:
+            self.publish()
         part = self._part or PartWriter(self._root, self._shards, self._index.meta.sensors)
         part.write(sequences)
         self._part = part
@@ -169,20 +171,31 @@ class RecordWriter:
         """
         if part.shard[0] != self._shards or self._part is not None:
             raise SchemaError(f"part {part.shard[0]} is not the next one, {self._shards}: adopt parts in order")
+        added: dict[ContactKey, None] = {}
         for name, site, trial, motion, _ in part.contacts:
             key = ContactKey(object_id=name, site=site, motion=motion, trial=trial)
-            self._check_key(key)
-            self._added[key] = None
+            self._check_key(key, added)
+            added[key] = None
+        self.begin()
         self._publish_cards()
         self._add(part)
+        self._added |= added
         self._index.write(self._root)
+
+    def begin(self) -> None:
+        """Write the root of the index, if there is none, before the first shard: shards without one have lost it."""
+        if not (self._root / INDEX).exists():
+            dataclasses.replace(self._index, complete=False).write(self._root)
 
     def publish(self) -> None:
         """Make everything written so far visible, in a shard of its own."""
+        self.begin()
         self._publish_cards()
         if self._part is not None:
-            part, self._part = self._part.publish(), None
-            self._add(part)
+            self._placed, self._part = self._part.publish(), None
+        if self._placed is not None:
+            self._add(self._placed)
+            self._placed = None
         self._index.write(self._root)
 
     def _publish_cards(self) -> None:
@@ -208,14 +221,14 @@ class RecordWriter:
     ) -> None:
         try:
             self._index.complete = kind is None
-            if kind is None or self._cards or self._part is not None:
+            if kind is None or self._cards or self._part is not None or self._placed is not None:
                 self.publish()
         finally:
             self._lock.close()
 
-    def _check_key(self, key: ContactKey) -> None:
+    def _check_key(self, key: ContactKey, added: Container[ContactKey] = ()) -> None:
         named = f"{key.object_id}/{key.site}/{key.motion}/{key.trial}"
-        if key in self:
+        if key in self or key in added:
             raise SchemaError(f"{named}: this contact is stored already; number the trials apart")
         if key.object_id not in self._numbers and key.object_id not in self._cards:
             raise SchemaError(f"{named}: object {key.object_id!r} has no card; write_object it first")
@@ -336,11 +349,14 @@ def write_lock(root: pathlib.Path) -> IO[str]:
     file = (root / ".lock").open("w")
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
+    except BlockingIOError as error:
         file.close()
         raise RecordsBusyError(
             f"{root} is being written by another process; wait for it or choose another path"
         ) from error
+    except OSError:  # of a file system without locks
+        file.close()
+        raise
     return file
 
 
@@ -355,8 +371,13 @@ def _content(root: pathlib.Path, index: Index) -> str:
 
 
 def _start(root: pathlib.Path, meta: RecordsMeta, resume: bool, kept: Callable[[str], bool]) -> Index:
-    """The index to go on from; files that no index lists are the remains of a killed writer and are removed."""
+    """The index to go on from; files that it does not list are the remains of a killed writer and are removed."""
     index = Index.new(meta)
+    remains = [file for file in sorted(root.glob("*.arrayrecord")) if not kept(file.name)]
+    if not (root / INDEX).exists() and remains:
+        raise RecordsExistError(
+            f"{remains[0]} is there, but no {INDEX}, which is written first: copy it back, or move the shards away"
+        )
     if (root / INDEX).exists():
         index = Index.read(root)
         if not resume:
@@ -371,18 +392,7 @@ def _start(root: pathlib.Path, meta: RecordsMeta, resume: bool, kept: Callable[[
         index.complete = False
     shards = {"contacts": index.contact_shards, "objects": index.object_shards}
     listed = {shard_file(kind, number) for kind, rows in shards.items() for number in rows["number"].tolist()}
-    for file in [*root.glob("*.arrayrecord"), *root.glob(".*.arrayrecord.*tmp")]:
-        if file.name not in listed and not kept(file.name):
+    for file in [*remains, *root.glob(".*.arrayrecord.*tmp")]:
+        if file.name not in listed:
             file.unlink()
     return index
-
-
-def convert(root: pathlib.Path, index: Index) -> bool:
-    """Give an index of version 1 or 2 its tables, which its next root states; True if it had none.
-
-    The old root is valid until then, and shards stay as they are.
-    """
-    if index.tables:
-        return False
-    index.convert(root, {name: card.split for name, card in Cards(root, index).items()})
-    return True

@@ -1,6 +1,8 @@
 """ArrayRecord files as the data set uses them: written under a temporary name, read at random through one numbering."""
 
 import collections
+import contextlib
+import errno
 import os
 import pathlib
 import threading
@@ -33,18 +35,25 @@ class ShardWriter:
     def __init__(self, root: pathlib.Path, kind: str, number: int):
         self._number, self._path = number, root / shard_file(kind, number)
         self._temporary = root / f".{self._path.name}.{os.getpid()}.tmp"  # two workers may try the same
-        self._writer = ArrayRecordWriter(_name(self._temporary), _OPTIONS)
+        with self._writing():
+            self._writer = ArrayRecordWriter(array_record_name(self._temporary), _OPTIONS)
         self._count = 0
 
     def write(self, data: bytes) -> None:
         """Append one entry."""
-        self._writer.write(data)
+        with self._writing():
+            self._writer.write(data)
         self._count += 1
 
     def publish(self) -> np.ndarray:
-        """Close, count, sync and rename the file; its row.  The writer reports no failure: counting finds it."""
-        self._writer.close()
-        reader = ArrayRecordReader(_name(self._temporary))
+        """Close, count, sync and rename the file; its row.  The writer reports not every failure: counting finds it.
+
+        Raises:
+          RecordsError: not all of it reached the disk.
+        """
+        with self._writing():
+            self._writer.close()
+        reader = ArrayRecordReader(array_record_name(self._temporary))
         found = reader.num_records() if reader.ok() else 0
         reader.close()
         if found < self._count:
@@ -53,6 +62,16 @@ class ShardWriter:
             os.fsync(file.fileno())
         self._temporary.replace(self._path)
         return np.array((self._number, found, self._path.stat().st_size), SHARD)
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except RuntimeError as error:
+            raise RecordsError(
+                f"{self._path} cannot be written ({error}): free some space, or make its folder writable; what was "
+                "published before is kept, and the same command goes on"
+            ) from error
 
 
 class Entries:
@@ -84,6 +103,8 @@ class Entries:
             return decode(self._source(shard)[place])
         except (RuntimeError, CorruptRecordsError) as error:
             file = f"{self._root}/{shard_file(self._kind, self._shards['number'][shard])}"
+            if os.strerror(errno.EMFILE) in str(error):
+                raise RecordsError(f"{file} cannot be opened ({error}): raise the limit of open files") from error
             raise CorruptRecordsError(
                 f"{file}, entry {place}: {error}; copy the file again from its source, or write the records again"
             ) from error
@@ -111,7 +132,7 @@ class Entries:
                 return self._open[shard]
         row = self._shards[shard]
         path = local(self._root, shard_file(self._kind, row["number"]), size=int(row["bytes"]))
-        spared = f"{_name(path)}[0:{row['entries']}]"  # the range spares opening it to count it
+        spared = f"{array_record_name(path)}[0:{row['entries']}]"  # the range spares opening it to count it
         source = ArrayRecordDataSource([spared])
         with self._lock:
             source = self._open.setdefault(shard, source)
@@ -132,7 +153,7 @@ def _check_size(path: pathlib.Path, bytes_: int) -> None:
         )
 
 
-def _name(path: pathlib.Path) -> str:
+def array_record_name(path: pathlib.Path) -> str:
     """The path as ArrayRecord takes it.
 
     Raises:

@@ -20,8 +20,8 @@ MAX_FILE, MAX_FUNCTION, MAX_ENTRIES = 400, 60, 15
 
 LAYERS = {
     "touchr1_jax": "types|validation|masked|skipping|text|models|rewards|rl|training|distributed|bench|asking",
-    "sensors_io": "errors|schema|arrays clock json_files units|sync taps force offsets|poses|deltas|quality|measures|"
-    "layer|codec|augment|remote tables selection|shards|index|contents|records|parts cards|"
+    "sensors_io": "errors signals|schema|arrays clock json_files units|sync taps force offsets|poses|deltas|quality|"
+    "measures|layer|codec|augment|remote tables selection|shards|index|contents|records|parts cards|"
     "pipeline importers scenes exporters|fields touches|calibration|devices|recording viewer|generate live overview|"
     "commands|__main__",
     "experiments": "core|study|mechanics|scenes|fields|encoder|recordings|bench|paper|engine|active|faults|ask|"
@@ -230,6 +230,21 @@ def test_every_global_name_exists():
     assert not wrong
 
 
+def of_the_locale(tree: ast.AST) -> set[int]:
+    """Lines that read or write a text in the encoding of the user's locale, which in another one are other words."""
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            texts = {"read_text": 0, "write_text": 1}.get(node.func.attr)
+            if len(node.args) == texts and "encoding" not in {keyword.arg for keyword in node.keywords}:
+                found.add(node.lineno)
+    return found
+
+
+def test_texts_state_their_encoding():
+    assert not {module: lines for module, tree in TREES.items() if (lines := of_the_locale(tree))}
+
+
 def test_the_rules_see_what_they_forbid():
     """Also an import inside a function, and one by its parent package."""
     assert len(SOURCES) > 50
@@ -240,3 +255,4 @@ def test_the_rules_see_what_they_forbid():
         imports_of(ast.parse("from . import schema"), "sensors_io.x")
     source = "import os\n\ndef f(x):\n    y = [os.sep for z in x]\n    return g(y, len(x), missing)\n"
     assert unknown_globals(source, {"os", "f", "g"}) == {"missing"}
+    assert of_the_locale(ast.parse("a.read_text()\na.read_text('utf-8')\na.write_text(x)\nwrite_text(a, x)")) == {1, 3}

@@ -6,7 +6,7 @@ import re
 import tempfile
 import threading
 import urllib.parse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import ClassVar
 
@@ -64,7 +64,7 @@ class DemoHandler(http.server.BaseHTTPRequestHandler):
         if split.path == "/":
             self._reply(self.demo.page())
         elif split.path == "/generated":
-            self._answer(f"{GENERATED}:{words}")
+            self._answer(lambda: self.demo.answer(f"{GENERATED}:{words}"))
         else:
             self.send_error(404)
 
@@ -83,11 +83,8 @@ class DemoHandler(http.server.BaseHTTPRequestHandler):
         if len(video) < int(length):
             self._reply(f"the video was cut off, {len(video)} bytes of {length}; send it again", status=400)
             return
-        with tempfile.TemporaryDirectory() as home:
-            suffix = re.search(r"\.[A-Za-z0-9]{1,7}$", asked.get("name", ""))
-            path = Path(home) / f"video{suffix[0] if suffix else ''}"
-            path.write_bytes(video)
-            self._answer(path, asked.get("sensor", ""))
+        suffix = re.search(r"\.[A-Za-z0-9]{1,7}$", asked.get("name", ""))
+        self._answer(lambda: self._of_video(video, suffix[0] if suffix else "", asked.get("sensor", "")))
 
     def log_message(self, format: str, *args: object) -> None:
         """Keep the terminal free."""
@@ -100,11 +97,20 @@ class DemoHandler(http.server.BaseHTTPRequestHandler):
         self.send_error(403, "open the address that the program printed")
         return False
 
-    def _answer(self, source: str | Path, sensor: str = "") -> None:
+    def _of_video(self, video: bytes, suffix: str, sensor: str) -> str:
+        with tempfile.TemporaryDirectory() as home:
+            path = Path(home) / f"video{suffix}"
+            path.write_bytes(video)
+            return self.demo.answer(path, sensor)
+
+    def _answer(self, answer: Callable[[], str]) -> None:
         try:
-            self._reply(self.demo.answer(source, sensor))
+            text, status = answer(), 200
         except (UserError, QuestionError) as error:
-            self._reply(str(error), status=400)
+            text, status = str(error), 400
+        except OSError as error:
+            text, status = f"the video could not be kept ({error}): free some space in TMPDIR of the program", 507
+        self._reply(text, status)
 
     def _reply(self, text: str, status: int = 200) -> None:
         content = text.encode()

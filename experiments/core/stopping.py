@@ -9,8 +9,10 @@ import weakref
 from collections.abc import Callable, Iterator
 from types import FrameType
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
-"""Control-C, and the signal that a scheduler sends before it takes the machine away."""
+from sensors_io.signals import ENDING
+
+SIGNALS = (signal.SIGINT, *ENDING)
+"""Control-C, the signal that a scheduler sends before it takes the machine away, and that of a closed terminal."""
 
 PATIENCE = b"\nstopping once this step is done and saved; a second signal ends at once, unsaved\n"
 """Written to standard error where a stop has to wait; a step that compiles takes minutes."""
@@ -43,7 +45,8 @@ class Stopping:
     @contextlib.contextmanager
     def listening(self) -> Iterator[None]:
         """Handle the signals inside the block; only a process's main thread can."""
-        before = {n: signal.signal(n, self._handle) for n in SIGNALS}
+        heard = [n for n in SIGNALS if n != signal.SIGHUP or signal.getsignal(n) is not signal.SIG_IGN]  # as by nohup
+        before = {n: signal.signal(n, self._handle) for n in heard}
         before[signal.SIGALRM] = signal.signal(signal.SIGALRM, self._again)
         report = sys.unraisablehook
         sys.unraisablehook = lambda lost: None if isinstance(lost.exc_value, Stopped) else report(lost)
@@ -95,7 +98,8 @@ class Stopping:
     def _handle(self, number: int, frame: FrameType | None) -> None:
         del frame
         for n in SIGNALS:
-            signal.signal(n, signal.SIG_DFL)
+            if signal.getsignal(n) is not signal.SIG_IGN:
+                signal.signal(n, signal.SIG_DFL)
         self._number = number
         signal.setitimer(signal.ITIMER_REAL, AGAIN_S, AGAIN_S)
         if not self._patient:

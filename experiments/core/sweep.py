@@ -13,7 +13,6 @@ import itertools
 import json
 import os
 import shlex
-import signal
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -31,6 +30,7 @@ from experiments.core.results import Cell, Column, Estimate, Picture, Results, T
 from experiments.core.runner import Experiment, load, parse, run_experiment
 from experiments.core.sweep_figures import chart, chosen_figures, number_of
 from sensors_io.errors import UserError
+from sensors_io.signals import exit_status
 from sensors_io.units import HERE, Launcher, LauncherError, UnitsError, WorkUnit, finish
 from touchr1_jax.bench.scoring import REPORTED
 
@@ -222,8 +222,8 @@ def run_sweep(
             status = run_experiment(experiment, unit.command, about)
             jax.clear_caches()  # programs of one configuration; those of all would fill the memory
             write_page(experiment.name, about, scale, folder, units, wanted)
-        except KeyboardInterrupt:  # between two runs; a run handles the signal itself
-            status = 128 + signal.SIGINT
+        except KeyboardInterrupt as error:  # between two runs; a run handles the signal itself
+            status = exit_status(error)
         if status > 1:
             print_lines("To continue the sweep, run the same command again.")
             return status
@@ -248,9 +248,9 @@ def launch_sweep(
     except (LauncherError, UnitsError) as error:
         print_error(f"{type(error).__name__}: {error}")
         return 1
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         print_lines("To continue the sweep, run the same command again.")
-        return 128 + signal.SIGINT
+        return exit_status(error)
     print_lines(f"sweep: {write_page(experiment.name, about, scale, folder, units, wanted)}")
     return 0
 

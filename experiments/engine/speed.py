@@ -238,7 +238,7 @@ def many_steps(size: JobSize, prefix: int, buckets: tuple[int, ...], steps: int,
         metrics = jax.block_until_ready(job.step())
         seconds[t] = time.perf_counter() - began
         if (t + 1) % RESIDENT_EVERY == 0:
-            pages = int(Path("/proc/self/statm").read_text().split()[1])
+            pages = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1])
             resident.append(pages * resource.getpagesize() / MIB)
             lengths.append(float(metrics["length"]))
             progress(t + 1, steps)

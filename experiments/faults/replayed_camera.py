@@ -149,7 +149,7 @@ class _MemoryLog:
         if now_s < self._next_s:
             return False
         self._next_s += self._every_s
-        self.resident_mb.append(int(Path("/proc/self/statm").read_text().split()[1]) * _PAGE_MB)
+        self.resident_mb.append(int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1]) * _PAGE_MB)
         if self._traced and len(self.resident_mb) == 2:
             self._first_kb = tracemalloc.get_traced_memory()[0] / 1e3
         return True

@@ -95,7 +95,7 @@ def read_ratings(path: Path) -> dict[str, Float[np.ndarray, "A"]]:
     if not path.is_file():
         return {}
     try:
-        table = json.loads(path.read_text())["objects"]
+        table = json.loads(path.read_text(encoding="utf-8"))["objects"]
         return {n: np.array([float(r.get(a.name, np.nan)) for a in LANGUAGE.attributes]) for n, r in table.items()}
     except MALFORMED as error:
         raise ImportSourceError(f"{path}: {error!r}; correct the entry or remove the file") from error

@@ -83,5 +83,5 @@ def _read(root: Path, contacts: int) -> dict[str, float]:
 
 def _memory_mb(name: str) -> float:
     """Memory of this process now, `VmRSS`, or its peak, `VmHWM`; that of getrusage would be the parent's too."""
-    (found,) = re.findall(rf"^{name}:\s+(\d+) kB$", Path("/proc/self/status").read_text(), re.MULTILINE)
+    (found,) = re.findall(rf"^{name}:\s+(\d+) kB$", Path("/proc/self/status").read_text(encoding="utf-8"), re.MULTILINE)
     return int(found) / 1024

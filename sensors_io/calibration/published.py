@@ -111,7 +111,7 @@ def gelslam(root: pathlib.Path) -> BallPresses:
 def feelanyforce_rows(root: pathlib.Path) -> np.ndarray:
     """Force and torque in the rows of FeelAnyForce's table, float64 [N, 6], NaN where a row is empty."""
     (table,) = (root / "feelanyforce").glob("*.csv")
-    cells = [line.rstrip("\n").split(",")[-1].split() for line in table.read_text().splitlines()[1:]]
+    cells = [line.rstrip("\n").split(",")[-1].split() for line in table.read_text(encoding="utf-8").splitlines()[1:]]
     return np.array([[float(c) for c in row] if len(row) == 6 else [np.nan] * 6 for row in cells])
 
 

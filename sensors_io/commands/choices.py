@@ -21,6 +21,7 @@ from sensors_io.devices.rgbd_camera import RgbdCameraConfig
 from sensors_io.devices.scene import SceneDeviceConfig
 from sensors_io.devices.tac3d import Tac3dConfig
 from sensors_io.devices.uvc import UvcConfig
+from sensors_io.signals import ENDING, Ended
 
 TactileConfig = UvcConfig | Tac3dConfig | BridgeConfig | ReplayConfig | SceneDeviceConfig
 AnyConfig = TactileConfig | NetFtConfig | RgbdCameraConfig
@@ -126,15 +127,19 @@ def readers(configs: Seq[AnyConfig], *, numbers: bool = False) -> Iterator[list[
 
 @contextlib.contextmanager
 def stop_on_interrupt() -> Iterator[threading.Event]:
-    """An event that Ctrl-C sets, so that a command ends its work instead of being torn out of it."""
+    """An event that a signal sets, so that a command ends its work; a second one tears it out, as a device may hang."""
     stop = threading.Event()
 
     def handle(number: int, frame: FrameType | None) -> None:
-        del number, frame
+        del frame
+        if stop.is_set():
+            raise Ended(number)
         stop.set()
 
-    before = signal.signal(signal.SIGINT, handle)
+    heard = [signal.SIGINT, *(n for n in ENDING if signal.getsignal(n) is not signal.SIG_IGN)]
+    before = {number: signal.signal(number, handle) for number in heard}
     try:
         yield stop
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)

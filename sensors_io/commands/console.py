@@ -1,6 +1,7 @@
 """Output shared by all commands: standard output, errors, a progress bar."""
 
 import contextlib
+import errno
 import io
 import sys
 import time
@@ -15,6 +16,20 @@ WIDTH = 110
 
 PLAIN_EVERY_S = 10.0
 """Between two lines of progress where there is no terminal."""
+
+
+FIXES = {
+    errno.ENOSPC: "free some space, or name another path",
+    errno.EDQUOT: "free some space, or name another path",
+    errno.EFBIG: "raise the limit of a file's size (ulimit -f), or name a path where files may be larger",
+    errno.EACCES: "make it accessible, or name another path",
+    errno.EROFS: "make it writable, or name another path",
+    errno.ENOENT: "name a path that is there; a folder must stay while it is written",
+    errno.ENOTDIR: "a file is in the place of a folder: move it away, or name another path",
+    errno.ENAMETOOLONG: "name a shorter path",
+    errno.EMFILE: "raise the limit of open files (ulimit -n)",
+}
+"""By the number of an error of the system."""
 
 
 def _console(*, stderr: bool) -> rich.console.Console:
@@ -33,8 +48,9 @@ def print_in_any_encoding() -> None:
 
 
 def complain(error: Exception) -> None:
-    """One line on stderr, as it stands."""
-    ERR.print(f"{type(error).__name__}: {error}", markup=False, highlight=False, soft_wrap=True)
+    """One line on stderr, as it stands; the system's errors name no fix, which is added."""
+    fix = f": {FIXES[error.errno]}" if isinstance(error, OSError) and error.errno in FIXES else ""
+    ERR.print(f"{type(error).__name__}: {error}{fix}", markup=False, highlight=False, soft_wrap=True)
 
 
 @contextlib.contextmanager

@@ -6,8 +6,9 @@ import pathlib
 import tyro
 
 from sensors_io.commands.console import OUT
+from sensors_io.contents import convert
 from sensors_io.index import Index
-from sensors_io.records import convert, write_lock
+from sensors_io.records import write_lock
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

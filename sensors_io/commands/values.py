@@ -1,6 +1,7 @@
 """Numbers and files that no command line means."""
 
 import dataclasses
+import errno
 import pathlib
 from typing import Any
 
@@ -30,6 +31,8 @@ def require_possible(value: Any, where: str = "") -> None:
     elif isinstance(value, tuple):
         for each in value:
             require_possible(each, where)
+    elif isinstance(value, pathlib.Path) and _in_circle(value):
+        raise ValueError(f"{where} is {value}: its symbolic links lead in a circle; correct them, or name another path")
     elif isinstance(value, pathlib.Path) and value.exists() and not (value.is_file() or value.is_dir()):
         raise ValueError(f"{where} is {value}: must be a file or a folder, not a pipe or a device; save what it gives")
     elif isinstance(value, pathlib.Path):
@@ -41,3 +44,11 @@ def require_possible(value: Any, where: str = "") -> None:
         raise ValueError(f"{where} is {value}: must be a number within ±{MOST:g}; correct it")
     elif isinstance(value, int) and where.endswith("port") and not 0 <= value <= PORTS:
         raise ValueError(f"{where} is {value}: must lie in 0 … {PORTS}; correct it")
+
+
+def _in_circle(path: pathlib.Path) -> bool:
+    try:
+        path.stat()
+    except OSError as error:
+        return error.errno == errno.ELOOP
+    return False

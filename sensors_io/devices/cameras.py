@@ -48,4 +48,4 @@ def _describe(node: pathlib.Path) -> CameraInfo:
 
 
 def _line(path: pathlib.Path) -> str:
-    return path.read_text(errors="replace").strip() if path.is_file() else ""
+    return path.read_text(encoding="utf-8", errors="replace").strip() if path.is_file() else ""

@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from sensors_io.contents import RESTS, rest_pictures
+from sensors_io.exporters.kept_file import KeptFile
 from sensors_io.exporters.selection import (
     VIEWS,
     FoundExport,
@@ -108,9 +109,20 @@ def _created(path: pathlib.Path, kind: Kind) -> tuple[Any, Callable[[Any, str, n
         zarr = library("zarr", "zarr")
         whole = lambda group, name, x: group.create_array(name, data=x, chunks=x.shape or "auto")
         return zarr.create_group(store=str(path), zarr_format=3), whole, lambda: None
-    file = library("h5py", "hdf5").File(path, "w", libver="latest")  # attributes larger than 64 kB
+    h5py, file = library("h5py", "hdf5"), KeptFile(path)
+    tree = h5py.File(file, "w", libver="latest")  # attributes larger than 64 kB
     squeezed = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
-    return file, lambda group, name, x: group.create_dataset(name, data=x, **squeezed if x.ndim else {}), file.close
+
+    def add(group: Any, name: str, x: np.ndarray) -> None:
+        group.create_dataset(name, data=x, **squeezed if x.ndim else {})
+        file.require_written()
+
+    def close() -> None:
+        with file:
+            tree.close()
+            file.require_written()
+
+    return tree, add, close
 
 
 @contextlib.contextmanager

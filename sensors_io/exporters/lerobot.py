@@ -76,7 +76,7 @@ def export_lerobot(selected: Selected, out: pathlib.Path, fps: int, progress: Pr
         cards = [{"object_id": card.object_id, "card": encode_card(card)} for card in selected.cards()]
         write_table(temporary / OURS / "objects.parquet", cards)
         put_rest_pictures(temporary / OURS, rest_pictures(selected.store.path))
-        (temporary / OURS / "records.json").write_text(head_text(selected))
+        (temporary / OURS / "records.json").write_text(head_text(selected), encoding="utf-8")
 
 
 def read_lerobot(path: pathlib.Path) -> FoundExport:
@@ -85,7 +85,7 @@ def read_lerobot(path: pathlib.Path) -> FoundExport:
     Raises:
       ExportError: an export of another version, or a library is not installed.
     """
-    head, reading = head_of((path / OURS / "records.json").read_text(), path), EpisodeReader(path)
+    head, reading = head_of((path / OURS / "records.json").read_text(encoding="utf-8"), path), EpisodeReader(path)
     plain = collections.defaultdict(list)
     for row in reading.table(f"{OURS}/sequences.parquet"):
         plain[row["episode_index"]].append((row["sensor"], row["plain"]))

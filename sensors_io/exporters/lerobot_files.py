@@ -112,9 +112,9 @@ class EpisodeFiles:
             "video_path": _VIDEO,
             "features": {**{n: self._described(n) for n in self.features}, **counted},
         }
-        (self._root / _INFO).write_text(json.dumps(info, indent=2))
+        (self._root / _INFO).write_text(json.dumps(info, indent=2), encoding="utf-8")
         stats = {name: moments.figures() for name, moments in self._stats.items()}
-        (self._root / _STATS).write_text(json.dumps(stats))
+        (self._root / _STATS).write_text(json.dumps(stats), encoding="utf-8")
 
     def _described(self, name: str) -> dict[str, Any]:
         entry = self.features[name]
@@ -227,7 +227,7 @@ class EpisodeReader:
 
     def __init__(self, root: pathlib.Path):
         self._pq, self._av = library("pyarrow.parquet", "lerobot"), library("av", "lerobot")
-        self._root, self._info = root, json.loads((root / _INFO).read_text())
+        self._root, self._info = root, json.loads((root / _INFO).read_text(encoding="utf-8"))
         if self._info["codebase_version"] != VERSION:
             raise ExportError(f"{root} is version {self._info['codebase_version']}: must be {VERSION}; convert it")
 

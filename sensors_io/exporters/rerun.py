@@ -39,7 +39,10 @@ def export_rerun(selected: Selected, out: pathlib.Path, progress: Progress) -> N
             start = min(int(sequence.host_time_ns[0]) for sequence in contact.values())
             for sensor, sequence in contact.items():
                 _log_sequence(rr, log, f"{name}/{rr.escape_entity_path_part(sensor)}", sequence, start)
-        log.flush()
+        try:
+            log.flush()
+        except RuntimeError as error:  # the library says on standard error which
+            raise ExportError(f"--out is {out}: cannot be written ({error}); free some space in its folder") from error
         log.disconnect()
 
 

@@ -108,7 +108,8 @@ def _rename(folder: pathlib.Path, name: str) -> None:
     """Give the bag's file its final name, which its metadata state."""
     [file] = folder.glob("*.mcap")
     said = folder / "metadata.yaml"
-    said.write_text(said.read_text().replace(file.name, f"{name}.mcap"))
+    text = said.read_text(encoding="utf-8").replace(file.name, f"{name}.mcap")
+    said.write_text(text, encoding="utf-8")
     file.rename(folder / f"{name}.mcap")
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sensors_io.errors import MALFORMED, UserError
+from sensors_io.errors import MALFORMED, UserError, of_system
 from sensors_io.importers.catalogue import Taken
 from sensors_io.importers.hdf5_map import QUANTITIES, UNITS, ArrayMap, LayoutMap, RowsMap, StreamMap
 from sensors_io.importers.keep import ImportSourceError, Keep, Skip, UnreadableError
@@ -76,6 +76,8 @@ def opened(path: pathlib.Path) -> Iterator[Any]:
     except (UserError, UnreadableError):
         raise
     except (*MALFORMED, OSError, RuntimeError) as error:  # what h5py and NumPy raise for damaged or absurd files
+        if of_system(error):
+            raise
         raise HDF5Error(f"cannot be read: {str(error).strip(chr(39))}") from error
 
 

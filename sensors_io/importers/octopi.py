@@ -53,7 +53,7 @@ def list_octopi(source: pathlib.Path, config: Keep) -> Catalogue:
     for path in samples:
         name = path.parent.name
         try:
-            data = json.loads(path.read_text())
+            data = json.loads(path.read_text(encoding="utf-8"))
             card = _card(data)
             if cards.setdefault(card.object_id, card) != card:
                 raise ValueError(f"contradicts an earlier sample of {card.object_id}")

@@ -127,7 +127,7 @@ def read_labels(path: pathlib.Path) -> list[LabelledObject]:
     if not path.is_file():
         raise ImportSourceError(f"{path} is missing: give the directory that holds labels.json and videos/")
     try:
-        entries = json.loads(path.read_text())["objects"]
+        entries = json.loads(path.read_text(encoding="utf-8"))["objects"]
         objects = [_labelled(entry) for entry in entries]
     except MALFORMED as error:
         raise ImportSourceError(f"{path}: {error!r}; correct the entry") from error

@@ -72,6 +72,8 @@ def read_video(path: pathlib.Path, keep: Keep) -> VideoFrames:
 
 @contextlib.contextmanager
 def _opened(path: pathlib.Path) -> Iterator[cv2.VideoCapture]:
+    if path.is_file():
+        path.open("rb").close()  # what the system refuses is no fault of the video
     try:
         capture = cv2.VideoCapture(path_text(path))
     except UserError as error:

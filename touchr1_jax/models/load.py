@@ -164,7 +164,7 @@ def peak_memory() -> int:
     """
     status = Path("/proc/self/status")
     if status.is_file():
-        (line,) = (x for x in status.read_text().splitlines() if x.startswith("VmHWM:"))
+        (line,) = (x for x in status.read_text(encoding="utf-8").splitlines() if x.startswith("VmHWM:"))
         return int(line.split()[1]) * 1024
     unit = 1 if sys.platform == "darwin" else 1024  # bytes there, kilobytes elsewhere
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit

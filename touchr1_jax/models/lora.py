@@ -52,7 +52,9 @@ class LoraConfig:
 
     @property
     def scale(self) -> float:
-        """s, α/r or α/√r."""
+        """s, α/r or α/√r; 0 without adapters."""
+        if not self.rank:
+            return 0.0
         return self.alpha / (self.rank**0.5 if self.rank_stabilised else self.rank)
 
     @property

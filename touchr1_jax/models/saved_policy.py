@@ -9,6 +9,7 @@ DIR/README.md           model card
 import contextlib
 import dataclasses
 import functools
+import glob
 import hashlib
 import json
 import os
@@ -23,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import traverse_util
 
+from touchr1_jax.models.exchange import exchanged
 from touchr1_jax.models.load import TOKENIZER_FILE, WeightsError
 from touchr1_jax.models.qwen.config import CONFIG_FILE
 from touchr1_jax.models.qwen.safetensors import read_header, read_tensor, write_file
@@ -126,7 +128,8 @@ def save_policy(folder: Path, saved: SavedPolicy, *, precision: Precision = "flo
 def published(folder: Path, parts: Collection[str] = ()) -> Iterator[Path]:
     """A new folder that takes the place of `folder` if the block ends without an error, and else vanishes.
 
-    Until the new one is in place the old one stays, or is put back.  A link is followed.
+    A killed process leaves the old one or the new one; where the file system cannot exchange two folders, the old one
+    may lie beside it under a hidden name, which `read_sealed` tells.  A link is followed.
 
     Args:
       folder: where.
@@ -135,7 +138,7 @@ def published(folder: Path, parts: Collection[str] = ()) -> Iterator[Path]:
     Raises:
       PolicyError: there is something else.
     """
-    folder = folder.resolve()
+    folder = Path(os.path.realpath(folder))  # `resolve` raises RuntimeError for links in a circle
     others = sorted(path.name for path in folder.glob("*") if path.name not in parts)
     if others or folder.is_file():
         held = f"it also holds {', '.join(others[:3])}, which would be lost" if others else "a file"
@@ -145,9 +148,10 @@ def published(folder: Path, parts: Collection[str] = ()) -> Iterator[Path]:
     unfinished.mkdir(parents=True)
     try:
         yield unfinished
-        if folder.exists():
-            folder.rename(old)
-        unfinished.rename(folder)
+        if not folder.exists() or not exchanged(unfinished, folder):
+            if folder.exists():
+                folder.rename(old)
+            unfinished.rename(folder)
     except BaseException:
         if old.exists() and not folder.exists():
             old.rename(folder)
@@ -285,6 +289,8 @@ def read_sealed(folder: Path, wanted: str, newest: int) -> dict[str, Any]:
     where = f"policy is {folder}"
     if not (folder / CONFIG_FILE).is_file():
         what = f"holds no {CONFIG_FILE}" if folder.is_dir() else "no such folder"
+        if left := sorted(folder.parent.glob(f".{glob.escape(folder.name)}.*.old")):
+            raise PolicyError(f"{where}: {what}; a killed process left {left[-1]}: rename it to {folder.name}")
         raise PolicyError(f"{where}: {what}; give a folder that `save_policy` or `python -m experiments export` wrote")
     try:
         found = json.loads((folder / CONFIG_FILE).read_text(encoding="utf-8"))

@@ -292,7 +292,7 @@ class Checkpoints:
         """Write the checksums of a checkpoint into its temporary folder, before Orbax renames it."""
         if jax.process_index() == 0:
             (where,) = self._directory.glob(f"{self._saving}.orbax-checkpoint-tmp*")
-            (where / CHECKSUMS).write_text(json.dumps(_file_checksums(where)))
+            (where / CHECKSUMS).write_text(json.dumps(_file_checksums(where)), encoding="utf-8")
 
     def _set_aside(self, step: int) -> Path:
         names = itertools.chain([f"damaged-{step}"], (f"damaged-{step}-{i}" for i in itertools.count(2)))
@@ -373,7 +373,7 @@ def changed_files(where: Path, inside: str = "") -> list[str]:
     if not path.is_file():
         return []
     try:
-        saved, found = json.loads(path.read_text()), _file_checksums(where, inside)
+        saved, found = json.loads(path.read_text(encoding="utf-8")), _file_checksums(where, inside)
         return sorted(name for name, x in saved.items() if name.startswith(inside) and found.get(name) != x)
     except (OSError, ValueError, AttributeError):
         return [CHECKSUMS]

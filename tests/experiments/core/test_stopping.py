@@ -12,7 +12,8 @@ from experiments.core.stopping import AGAIN_S, SIGNALS, Stopped, Stopping
 
 @pytest.fixture(autouse=True)
 def handlers():
-    """The handlers that the test began with, which are there again after each block."""
+    """The handlers that the test began with, which are there again after each block; nohup would ignore SIGHUP."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     before = [signal.getsignal(n) for n in SIGNALS]
     yield before
     assert [signal.getsignal(n) for n in SIGNALS] == before
@@ -23,6 +24,18 @@ def test_a_signal_raises_at_once(number):
     with pytest.raises(Stopped, match=number.name) as stop, Stopping().listening():
         signal.raise_signal(number)
     assert stop.value.number == number
+
+
+def test_a_closed_terminal_stops_no_run_that_nohup_started():
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with Stopping().listening():
+            signal.raise_signal(signal.SIGHUP)
+        with contextlib.suppress(Stopped), Stopping().listening():
+            signal.raise_signal(signal.SIGTERM)
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 def patiently(inside) -> None:
@@ -40,7 +53,7 @@ def test_a_patient_block_ends_before_the_stop_which_is_announced(capfd):
     done = []
     with pytest.raises(Stopped, match="SIGTERM"):
         patiently(lambda: done.extend(signal.getsignal(n) for n in SIGNALS))
-    assert done == [signal.SIG_DFL] * 2
+    assert done == [signal.SIG_DFL] * 3
     assert "stopping once this step is done and saved" in capfd.readouterr().err
     with pytest.raises(ZeroDivisionError):
         patiently(lambda: 1 / 0)

@@ -153,6 +153,7 @@ def test_settings_are_checked(fields, message):
 
 
 def test_the_scale_by_hand():
+    assert LoraConfig(rank=0).scale == LoraConfig(rank=0, rank_stabilised=True).scale == 0
     assert LoraConfig(rank=16, alpha=32.0).scale == 2
     assert LoraConfig(rank=16, alpha=32.0, rank_stabilised=True).scale == 8
 

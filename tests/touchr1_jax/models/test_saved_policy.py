@@ -1,5 +1,6 @@
 """A policy survives its folder; folders of something else, of another version and damaged ones are named."""
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -12,6 +13,7 @@ import pytest
 from experiments.faults.trainings.small_study import MODEL
 from tests.touchr1_jax.drawn import draw_params
 from touchr1_jax.asking import load_policy
+from touchr1_jax.models import saved_policy
 from touchr1_jax.models.saved_policy import PolicyError, PolicyInput, SavedPolicy, published, read_policy, save_policy
 from touchr1_jax.models.touch_policy import build_policy, touch_shapes
 from touchr1_jax.text.tokenizer import word_tokenizer
@@ -106,6 +108,64 @@ def test_a_folder_of_other_parts_or_a_file_is_not_replaced(tmp_path):
         with pytest.raises(PolicyError, match=said), published(path, ("config.json",)):
             pass
     assert (tmp_path / "text").read_text() == "x"
+
+
+def test_links_in_a_circle_are_an_error_of_the_system(tmp_path):
+    (tmp_path / "a").symlink_to(tmp_path / "b")
+    (tmp_path / "b").symlink_to(tmp_path / "a")
+    with pytest.raises(OSError, match=r"'.*/a'"), published(tmp_path / "a"):
+        pass
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b"]
+
+
+class Killed(BaseException):
+    """The process is gone: nothing that it would still do to its files happens."""
+
+
+def replaced_until(folder, step, monkeypatch, exchange):
+    """Replace a folder in a process that is killed before one of its steps on the disk; the steps that it did."""
+    done = []
+
+    def counted(act, cannot):
+        def run(*args, **options):
+            if len(done) == step or "killed" in done:
+                done.append("killed")
+                raise Killed
+            done.append(act.__name__)
+            return False if cannot else act(*args, **options)
+
+        return run
+
+    with monkeypatch.context() as disk:
+        disk.setattr(saved_policy, "exchanged", counted(saved_policy.exchanged, not exchange))
+        for place, name in ((Path, "rename"), (Path, "mkdir"), (saved_policy.shutil, "rmtree")):
+            disk.setattr(place, name, counted(getattr(place, name), False))
+        with contextlib.suppress(Killed), published(folder, ("config.json",)) as unfinished:
+            (unfinished / "config.json").write_text("new")
+    return done
+
+
+@pytest.mark.parametrize("exchange", [True, False])
+def test_a_kill_at_any_point_leaves_the_old_folder_or_the_new_one(tmp_path, monkeypatch, exchange):
+    """Where folders cannot be exchanged, the old one may be beside its place, and the error says where."""
+    seen, step = [], 0
+    while not seen or seen[-1] is not None:
+        folder = tmp_path / str(step) / "policy"
+        folder.mkdir(parents=True)
+        (folder / "config.json").write_text("old")
+        done = replaced_until(folder, step, monkeypatch, exchange)
+        step += 1
+        if folder.exists():
+            seen.append((folder / "config.json").read_text())
+        else:
+            with pytest.raises(PolicyError, match=r"a killed process left .*/\.policy\.\d+\.old: rename it to policy"):
+                read_policy(folder)
+            seen.append("told")
+        if "killed" not in done:
+            seen.append(None)
+    kinds = list(dict.fromkeys(seen))
+    assert kinds == (["old", "new", None] if exchange else ["old", "told", "new", None])
+    assert [path.name for path in folder.parent.iterdir()] == ["policy"]
 
 
 def edit(folder, **changes):
@@ -210,6 +270,7 @@ def test_a_policy_that_cannot_be_replaced_stays(saved, folder, monkeypatch):
             raise OSError("no rename")
         return rename(self, target)
 
+    monkeypatch.setattr(saved_policy, "exchanged", lambda a, b: False)
     monkeypatch.setattr(Path, "rename", fails)
     with pytest.raises(OSError, match="no rename"):
         save_policy(folder, saved, precision="int8")

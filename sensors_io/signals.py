@@ -1,0 +1,51 @@
+"""The signals that end a program: what it has begun is closed or removed, as after Ctrl-C."""
+
+import signal
+import sys
+from types import FrameType
+
+ENDING = (signal.SIGTERM, signal.SIGHUP)
+"""The signal of a scheduler, and that of a terminal or a connection that was closed."""
+
+
+class Ended(KeyboardInterrupt):
+    """One of `ENDING` came; all that handles Ctrl-C handles it."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+
+def end_as_interrupted() -> None:
+    """Raise `Ended` at the first of `ENDING`; a signal that is ignored, as under nohup, stays so."""
+    for number in ENDING:
+        if signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, _raise)
+
+
+def leave_interrupted(error: KeyboardInterrupt, told: str) -> int:
+    """Print what became of the work, let another signal end the process at once, and return the exit status."""
+    for number in (signal.SIGINT, *ENDING):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, signal.SIG_DFL)
+    say(told)
+    return exit_status(error)
+
+
+def exit_status(error: KeyboardInterrupt) -> int:
+    """128 + the number of the signal, as shells have it."""
+    return 128 + (error.number if isinstance(error, Ended) else signal.SIGINT)
+
+
+def say(text: str) -> None:
+    """Print to standard error, if there is one; nothing is imported for it."""
+    try:
+        sys.stderr.write(f"{text}\n")
+        sys.stderr.flush()
+    except (OSError, ValueError, AttributeError):  # closed, full, or a terminal that is gone
+        return
+
+
+def _raise(number: int, frame: FrameType | None) -> None:
+    del frame
+    raise Ended(number)

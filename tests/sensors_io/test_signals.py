@@ -1,0 +1,74 @@
+"""Signals that end a program do what Ctrl-C does; one that is ignored stays so; a second one ends it at once."""
+
+import signal
+
+import pytest
+
+from sensors_io.__main__ import main
+from sensors_io.commands.choices import stop_on_interrupt
+from sensors_io.signals import ENDING, Ended, end_as_interrupted, leave_interrupted, say
+
+ALL = (signal.SIGINT, *ENDING)
+
+
+@pytest.fixture(autouse=True)
+def handlers():
+    """Handlers of a program that was just started, and afterwards those of the tests."""
+    before = {number: signal.getsignal(number) for number in ALL}
+    for number in ALL:
+        signal.signal(number, signal.SIG_DFL)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("number", ENDING)
+def test_a_signal_unwinds_the_program_as_ctrl_c_does(number, capsys):
+    end_as_interrupted()
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        signal.raise_signal(number)
+    assert leave_interrupted(stopped.value, "run it again") == 128 + number
+    assert capsys.readouterr().err == "run it again\n"
+    assert {signal.getsignal(n) for n in ALL} == {signal.SIG_DFL}
+
+
+def test_a_signal_that_is_ignored_stays_so():
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    end_as_interrupted()
+    signal.raise_signal(signal.SIGHUP)
+    with stop_on_interrupt() as stop:
+        signal.raise_signal(signal.SIGHUP)
+    assert not stop.is_set()
+    assert leave_interrupted(KeyboardInterrupt(), "") == 128 + signal.SIGINT
+    assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+
+
+@pytest.mark.parametrize("number", ALL)
+def test_devices_end_in_order_at_the_first_signal_and_at_once_at_the_second(number):
+    with stop_on_interrupt() as stop:
+        signal.raise_signal(number)
+        assert stop.is_set()
+        with pytest.raises(Ended):
+            signal.raise_signal(number)
+
+
+@pytest.mark.parametrize("lost", [OSError, ValueError])
+def test_words_that_nobody_reads_raise_nothing(monkeypatch, lost):
+    class Gone:
+        def write(self, text):
+            raise lost
+
+    for stream in (None, Gone()):
+        monkeypatch.setattr("sys.stderr", stream)
+        say("x")
+
+
+def test_help_that_cannot_be_printed_is_one_line(monkeypatch, capsys):
+    def full(*args, **options):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr("sensors_io.commands.console.OUT.print", full)
+    assert main(["--help"]) == 1
+    assert capsys.readouterr().err.startswith(
+        "OSError: No space left on device: let standard output and standard error"
+    )
