@@ -207,7 +207,7 @@ class WrittenSet:
     kept: ResumedSet
 
 
-def write_and_kill(scenes: SceneConfig, context: Context, kills: int, seed: int) -> WrittenSet:
+def write_and_kill(scenes: SceneConfig, context: Context, kills: int) -> WrittenSet:
     """Write the set once undisturbed and once with kills; the copies are removed after the comparison."""
     home = context.directory / "written"
     shutil.rmtree(home, ignore_errors=True)
@@ -219,8 +219,7 @@ def write_and_kill(scenes: SceneConfig, context: Context, kills: int, seed: int)
     for name in ("objects", "sequences", "frames", "image_px", "contact_grid"):
         command += [f"--{name.replace('_', '-')}", str(getattr(scenes, name))]
     with context.progress("killing and resuming", kills + 1) as advance:
-        shard_s = rate.seconds / shards
-        killed_times = killed_and_resumed(command, killed, kills, shards, shard_s, seed, advance)
+        killed_times = killed_and_resumed(command, killed, kills, shards, rate.seconds / shards, advance)
     with context.progress("comparing", scenes.contact_count) as advance:
         kept = compare(whole, killed, advance)
     store = RecordStore(whole)
@@ -237,7 +236,6 @@ def killed_and_resumed(
     kills: int,
     shards: int,
     shard_s: float,
-    seed: int,
     advance: Callable[[], object] = lambda: None,
 ) -> int:
     """Run the command that writes records, kill it with SIGKILL at random moments, let the last run finish.
@@ -251,8 +249,7 @@ def killed_and_resumed(
     """
     require(kills < shards, "kills", kills, f"must be < {shards}, the shards of the set, or more contacts be written")
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(out.parent / "compiled")}
-    rng = np.random.default_rng(seed)
-    killed = 0
+    rng, killed = np.random.default_rng(0), 0
     for shard in np.sort(rng.choice(shards - 1, kills, replace=False)):
         process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:

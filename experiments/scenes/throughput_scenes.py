@@ -16,14 +16,13 @@ Expected: some 800 records a second at 112², so that the paper's 1.32 million r
 
 import dataclasses
 import itertools
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
-from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context
-from experiments.core.results import Cell, Picture, Requirement, Results, Table, at_least, at_most, named_table
+from experiments.core.results import Cell, Requirement, Results, Table, at_least, at_most, named_table
 from experiments.core.runner import Experiment
 from experiments.scenes import throughput_rates
 from experiments.scenes.throughput_rates import RecordRate, ResumedSet, WrittenSet
@@ -51,37 +50,20 @@ Parts = Mapping[str, Mapping[str, float]]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ThroughputConfig:
-    """Sizes of the measurements.
+    """Sizes of the measurements."""
 
-    Args:
-      image_px: side of the ordinary pictures.
-      large_px: side of the large ones.
-      frames: of a sequence.
-      contact_grid: of the contact solver.
-      feed_contacts: fed at `image_px`; a contact is 360 records.
-      large_contacts: fed at `large_px`.
-      written_contacts: written, and written again under kills.
-      kills: of the second writer, at random moments; it must write more shards than that.
-      stage_objects: over which the parts are timed, per sensor.
-      stage_sensors: whose parts are timed.
-      leak_objects: whose labels are predicted from force alone.
-      threads: that generate.
-      seed: of the moments of the kills.
-    """
-
-    image_px: int = 112
-    large_px: int = 448
-    frames: int = PAPER_FRAMES
-    contact_grid: int = 64
-    feed_contacts: int = 56
-    large_contacts: int = 8
-    written_contacts: int = 56
-    kills: int = 5
-    stage_objects: int = 2
-    stage_sensors: tuple[str, ...] = SENSORS
-    leak_objects: int = PAPER_OBJECTS
-    threads: int = 2
-    seed: int = 0
+    image_px: int = 112  # side of the ordinary pictures
+    large_px: int = 448  # side of the large ones
+    frames: int = PAPER_FRAMES  # of a sequence
+    contact_grid: int = 64  # of the contact solver
+    feed_contacts: int = 56  # fed at `image_px`; a contact is 360 records
+    large_contacts: int = 8  # fed at `large_px`
+    written_contacts: int = 56  # written, and written again under kills
+    kills: int = 5  # of the second writer, at random moments; it must write more shards than that
+    stage_objects: int = 2  # over which the parts are timed, per sensor
+    stage_sensors: tuple[str, ...] = SENSORS  # whose parts are timed
+    leak_objects: int = PAPER_OBJECTS  # whose labels are predicted from force alone
+    threads: int = 2  # that generate
 
     def scenes(self, contacts: int, image_px: int) -> SceneConfig:
         """The protocol over so many contacts, with the paper's share of presses."""
@@ -95,21 +77,12 @@ class ThroughputConfig:
         )
 
 
-class NamedRate(NamedTuple):
-    """A measured and a required rate, records per second; bytes per record of a written set."""
-
-    name: str
-    rate: RecordRate
-    required: float
-    bytes: float | None = None
-
-
 def run(config: ThroughputConfig, context: Context) -> Results:
     """Feed, write, kill, time the parts; what was measured before an interruption is not measured again."""
     feed = _feed(config, context, "feed/0", config.feed_contacts, config.image_px)
     large = _feed(config, context, "large/0", config.large_contacts, config.large_px)
     to_write = config.scenes(config.written_contacts, config.image_px)
-    write = lambda: throughput_rates.write_and_kill(to_write, context, config.kills, config.seed)
+    write = lambda: throughput_rates.write_and_kill(to_write, context, config.kills)
     found = context.once("written/0", write)
     kept = ResumedSet(**found["kept"])
     written = WrittenSet(**found | {"rate": RecordRate(**found["rate"]), "kept": kept})
@@ -118,7 +91,6 @@ def run(config: ThroughputConfig, context: Context) -> Results:
         name: throughput_rates.part_costs(scenes, SENSORS.index(name), config.stage_objects)
         for name in context.each("timing parts", config.stage_sensors, still=True)
     }
-    floor = _floor_table(config)
     paper = SceneConfig(
         objects=config.leak_objects,
         sequences=len(SENSORS) * round(config.leak_objects * PAPER_SEQUENCES / len(SENSORS) / PAPER_OBJECTS),
@@ -126,11 +98,6 @@ def run(config: ThroughputConfig, context: Context) -> Results:
     with context.progress("planning the paper's set", 1) as advance:
         leaks = force_leaks(paper)
         advance()
-    rates = (
-        NamedRate(f"feed {config.image_px}²", feed, FEED_RATE),
-        NamedRate(f"feed {config.large_px}²", large, LARGE_RATE),
-        NamedRate(f"written {config.image_px}²", written.rate, PAPER_RECORDS / WRITTEN_HOURS / 3600, written.bytes),
-    )
     lost = kept.missing + kept.repeated + kept.damaged + kept.differing
     return Results(
         verdict=(
@@ -139,8 +106,13 @@ def run(config: ThroughputConfig, context: Context) -> Results:
             f"{lost} contacts are missing, repeated, damaged or different after {written.kills} kills of their writer.",
         ),
         requirements=_requirements(feed, large, written, max(leaks[-1][name] for name in ORDINAL)),
-        tables=(_rate_table(rates), _part_table(config, parts), floor, left_out_table(paper), _leak_table(leaks)),
-        pictures=(_picture(config, rates, parts),),
+        tables=(
+            _rate_table(config, feed, large, written),
+            _part_table(config, parts),
+            _floor_table(config),
+            left_out_table(paper),
+            _leak_table(leaks),
+        ),
         settings={"threads": config.threads, "frames": config.frames, "contact_grid": config.contact_grid},
         data={"feed_records": feed.records, "large_records": large.records, "written_records": written.rate.records},
         timing={"feeding": feed.seconds, "feeding large": large.seconds, "writing": written.rate.seconds},
@@ -246,29 +218,30 @@ def _requirements(feed: RecordRate, large: RecordRate, written: WrittenSet, leak
     )
 
 
-def _rate_table(rates: Sequence[NamedRate]) -> Table:
+def _rate_table(config: ThroughputConfig, feed: RecordRate, large: RecordRate, written: WrittenSet) -> Table:
+    rates = (
+        (f"feed {config.image_px}²", feed, None),
+        (f"feed {config.large_px}²", large, None),
+        (f"written {config.image_px}²", written.rate, written.bytes),
+    )
     return named_table(
         "Rates",
         [
             {
-                "how": r.name,
-                "records": r.rate.records,
-                "by the clock": r.rate.per_second,
-                "one core": r.rate.cpu_ms,
-                "two idle cores": 2000 / r.rate.cpu_ms,
-                "1.32 million": PAPER_RECORDS / r.rate.per_second / 3600,
-                "size": r.bytes,
+                "how": name,
+                "records": rate.records,
+                "by the clock": rate.per_second,
+                "one core": rate.cpu_ms,
+                "two idle cores": 2000 / rate.cpu_ms,
+                "1.32 million": PAPER_RECORDS / rate.per_second / 3600,
+                "size": size,
             }
-            for r in rates
+            for name, rate, size in rates
         ],
-        formats={
-            **dict.fromkeys(("by the clock", "two idle cores", "size"), ".0f"),
-            **{"records": "d", "one core": ".2f", "1.32 million": ".2f"},
-        },
-        units={
-            **dict.fromkeys(("by the clock", "two idle cores"), "records/s"),
-            **{"one core": "ms/record", "1.32 million": "h", "size": "bytes/record"},
-        },
+        formats=dict.fromkeys(("by the clock", "two idle cores", "size"), ".0f")
+        | {"records": "d", "one core": ".2f", "1.32 million": ".2f"},
+        units=dict.fromkeys(("by the clock", "two idle cores"), "records/s")
+        | {"one core": "ms/record", "1.32 million": "h", "size": "bytes/record"},
         meanings={"two idle cores": "2 s over the time of one core"},
         note="The start, a minute of compiling and looking at objects, is left out.",
     )
@@ -311,24 +284,6 @@ def _leak_table(leaks: list[dict[str, Any]]) -> Table:
         units={**dict.fromkeys((*ORDINAL, reach), "%"), "median peak": "N"},
         note="Balanced accuracy of the likeliest level given the force; chance is 33 %.  Rejecting flagged frames is "
         "the same as dropping them.",
-    )
-
-
-def _picture(config: ThroughputConfig, rates: Sequence[NamedRate], parts: Parts) -> Picture:
-    measured = Series(x=[r.rate.per_second for r in rates], bar=True)
-    marks = Series("required", x=[r.required for r in rates], line="", marker="|", size=300, colour="black")
-    names = list(next(iter(parts.values())))
-    stacked = [Series(part, x=[max(costs[part], 0.0) for costs in parts.values()], bar=True) for part in names]
-    panels = [
-        Panel([measured, marks], rows=[r.name for r in rates], x_label="records/s by the clock", written=".0f"),
-        Panel(stacked, rows=list(parts), stacked=True, x_label="ms of one core a record"),
-    ]
-    return Picture(
-        name="throughput",
-        title="Rates, and time by part",
-        caption=f"Records a second on {config.threads} threads; the work on a record with a picture of "
-        f"{config.image_px}², friction where the object moves.",
-        content=draw(panels, size=(8.6, 1.1 + 0.34 * max(len(rates), len(parts) + 1))),
     )
 
 

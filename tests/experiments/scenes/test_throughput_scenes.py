@@ -45,7 +45,7 @@ def cheap(monkeypatch):
 
 @pytest.mark.long
 def test_the_experiment_runs_shrunken(cheap, tmp_path):
-    def killed(command, out, kills, shards, shard_s, seed, advance):
+    def killed(command, out, kills, shards, shard_s, advance):
         assert command[6:10] == ["--objects", "4", "--sequences", "32"]
         assert shards == 1
         generate.generate_records(config.scenes(8, 32), out)
@@ -93,7 +93,7 @@ def test_a_writer_is_killed_at_random_moments_and_goes_on(tmp_path):
         "    time.sleep(0.1); (out / f'contacts-{i}').touch()\n"
     )
     command, out = [sys.executable, str(script), str(tmp_path / "out")], tmp_path / "out"
-    assert throughput_rates.killed_and_resumed(command, out, kills=3, shards=6, shard_s=0.1, seed=0) == 3
+    assert throughput_rates.killed_and_resumed(command, out, kills=3, shards=6, shard_s=0.1) == 3
     assert len(list(out.iterdir())) == 6
 
 
