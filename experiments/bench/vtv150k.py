@@ -59,11 +59,9 @@ class VTVProtocolConfig:
 
     scenes: SceneConfig = SceneConfig(objects=400, sequences=4 * 2800, frames=24, image_px=56, contact_grid=32)
     """Its protocol moves only objects that bear it: about three in ten have both motions, the flat ones more often."""
-    moments: int = 8
-    """Frames of a motion that are read."""
+    moments: int = 8  # frames of a motion that are read
     probe: ProbeConfig = ProbeConfig()
-    questions: int = 960
-    """Questions of each task that compares recordings."""
+    questions: int = 960  # questions of each task that compares recordings
 
 
 class RecordingFeatures(NamedTuple):

@@ -11,23 +11,15 @@ from experiments.core.look import LOOK, png, svg
 
 @dataclasses.dataclass(frozen=True)
 class Heatmap:
-    """A matrix in colours.
+    """A matrix in colours."""
 
-    Args:
-      values: [R, C].
-      rows, columns: their names.
-      title: above it.
-      cells: what is written in each cell [R, C]; nothing by default.
-      crosses: bool [R, C], cells to cross out; none by default.
-    """
-
-    values: np.ndarray
+    values: np.ndarray  # [R, C]
     _: dataclasses.KW_ONLY
-    rows: Sequence[str]
+    rows: Sequence[str]  # their names
     columns: Sequence[str]
-    title: str = ""
-    cells: Sequence[Sequence[str]] = ()
-    crosses: np.ndarray | None = None
+    title: str = ""  # above it
+    cells: Sequence[Sequence[str]] = ()  # what is written in each cell [R, C]; nothing by default
+    crosses: np.ndarray | None = None  # bool [R, C], cells to cross out; none by default
 
 
 def heatmaps(

@@ -164,8 +164,7 @@ class Trace:
 
     text: str
     slots: tuple[Slot, ...]
-    right: bool | None = None
-    """Whether the answer concludes the true level; `None` where that is not known."""
+    right: bool | None = None  # whether the answer concludes the true level; `None` where that is not known
 
     def __post_init__(self) -> None:
         end = 0
@@ -177,39 +176,26 @@ class Trace:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RolloutExample:
-    """One answer of the report, with the touch that it is about.
-
-    Args:
-      arm, object_id: policy and object.
-      question, label, trace: text.
-      slots: the parsed pieces of the trace, in order and disjoint.
-      reward: the value of each term; `total` their weighted sum.
-      frames: sensor → uint8 [F, H, W, 3], RGB.
-      force_n: sensor → float [F, 3].
-      view: uint8 [H, W, 3] RGB picture of the object, or `None`.
-      fields: sensor → uint8 [H, W, 3], its fields at the strongest press, drawn.
-      instead: replacement of the touch → the answer to it.
-      others: other arm → its answer to the same question.
-      right: whether the answer concludes the true level; `None` where that is not known.
-      group: heading that it shares with its neighbours; none by default.
-    """
+    """One answer of the report, with the touch that it is about."""
 
     arm: str
     object_id: str
     question: str
     label: str
     trace: str
-    slots: tuple[Slot, ...]
-    reward: Mapping[str, float]
+    slots: tuple[Slot, ...]  # the parsed pieces of the trace, in order and disjoint
+    reward: Mapping[str, float]  # the value of each term; `total` their weighted sum
     total: float
-    frames: Mapping[str, np.ndarray]
-    force_n: Mapping[str, np.ndarray]
-    view: np.ndarray | None = None
+    frames: Mapping[str, np.ndarray]  # sensor → uint8 [F, H, W, 3], RGB
+    force_n: Mapping[str, np.ndarray]  # sensor → float [F, 3]
+    view: np.ndarray | None = None  # uint8 [H, W, 3] RGB picture of the object, or `None`
     fields: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    """Sensor → uint8 [H, W, 3], its fields at the strongest press, drawn."""
     instead: Mapping[str, Trace] = dataclasses.field(default_factory=dict)
-    others: Mapping[str, Trace] = dataclasses.field(default_factory=dict)
-    right: bool | None = None
-    group: str = ""
+    """Replacement of the touch → the answer to it."""
+    others: Mapping[str, Trace] = dataclasses.field(default_factory=dict)  # other arm → its answer to the same question
+    right: bool | None = None  # whether the answer concludes the true level; `None` where that is not known
+    group: str = ""  # heading that it shares with its neighbours; none by default
 
     def __post_init__(self) -> None:
         Trace(text=self.trace, slots=self.slots)

@@ -91,16 +91,14 @@ class SweepCommand:
     run is not run again.
     """
 
-    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
-    """An experiment."""
+    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]  # an experiment
     vary: tyro.conf.UseAppendAction[tuple[str, ...]]
     """An option and its values, as in `--vary grpo.lr-scale=50,100,200`; once for each option that varies."""
     into: Path | None = None
     """Folder of the sweep; by default in RUNS_DIR/sweeps, named after the values.  With more values it grows."""
     figures: tuple[str, ...] = ()
     """Words in the names of the figures to show, as `compare` names them; by default the main ones."""
-    runs_dir: Path = Path("runs")
-    """Folder of all runs."""
+    runs_dir: Path = Path("runs")  # folder of all runs
     launcher: Annotated[Launcher, tyro.conf.arg(name="")] = HERE
 
     def run(self, rest: Sequence[str], package: str = "experiments") -> int:

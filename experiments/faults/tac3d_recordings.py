@@ -32,24 +32,16 @@ _REPEATS = 20  # decodings in a round of timing
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RecordingCheck:
-    """One recording, through the reader and by its arrays alone.
-
-    Args:
-      name: of the recording.
-      frames: in it.
-      missing, gap_s: missing indices, largest time between two frames; by the arrays.
-      counts: of the reader.
-      read_gap_s: largest time between two samples of the reader.
-      late_s: of arrival after the mapped stamps, median and largest, [2]; NaN where arrival was not recorded.
-    """
+    """One recording, through the reader and by its arrays alone."""
 
     name: str
     frames: int
-    missing: int
-    gap_s: float
-    counts: Counts
-    read_gap_s: float
+    missing: int  # missing indices, by the arrays
+    gap_s: float  # largest time between two frames, by the arrays
+    counts: Counts  # of the reader
+    read_gap_s: float  # largest time between two samples of the reader
     late_s: np.ndarray
+    """Of arrival after the mapped stamps, median and largest, [2]; NaN where arrival was not recorded."""
 
 
 def recordings(data_dir: pathlib.Path | None) -> list[pathlib.Path]:

@@ -42,25 +42,15 @@ PICTURES = 20  # pictures of each folder for the recognition of marker gels
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FieldsConfig:
-    """Sizes of the measurements.
+    """Sizes of the measurements."""
 
-    Args:
-      data_dir: folder of the recordings; `None` for generated input alone.
-      rounds: of timing.
-      folds: of the presses.
-      generated_presses: of each generated ball.
-      strange_lamps: measure balls under lamps that the calibration's model does not cover, too.
-      motion: measure the fields of motion, too.
-      seed: of folds and generated presses.
-    """
-
-    data_dir: pathlib.Path | None = None
-    rounds: int = 51
-    folds: int = 5
-    generated_presses: int = 24
-    strange_lamps: bool = True
-    motion: bool = True
-    seed: int = 0
+    data_dir: pathlib.Path | None = None  # folder of the recordings; `None` for generated input alone
+    rounds: int = 51  # of timing
+    folds: int = 5  # of the presses
+    generated_presses: int = 24  # of each generated ball
+    strange_lamps: bool = True  # measure balls under lamps that the calibration's model does not cover, too
+    motion: bool = True  # measure the fields of motion, too
+    seed: int = 0  # of folds and generated presses
 
 
 def run(config: FieldsConfig, context: Context) -> Results:

@@ -36,19 +36,12 @@ from sensors_io.schema import Flag
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RealConfig:
-    """Folders to read.
+    """Folders to read."""
 
-    Args:
-      data_dir: the folder of recordings.
-      folders: at most so many of them.
-      shown: pictures drawn of each.
-      folds: of the held-out errors.
-    """
-
-    data_dir: pathlib.Path | None = None
-    folders: int = 99
-    shown: int = 5
-    folds: int = 5
+    data_dir: pathlib.Path | None = None  # the folder of recordings
+    folders: int = 99  # at most so many of them
+    shown: int = 5  # pictures drawn of each
+    folds: int = 5  # of the held-out errors
 
 
 HELD_OUT = {

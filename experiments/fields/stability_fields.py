@@ -34,26 +34,16 @@ METHODS = (OURS, "this, LK alone", "LK to rest", "LK frame to frame", "DIS mediu
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FieldStabilityConfig:
-    """Sizes of the measurements.
+    """Sizes of the measurements."""
 
-    Args:
-      data_dir: folder of the recordings; `None` for generated gels alone.
-      gels, seeds: gels, and motions of each; presses under each level for depth.
-      methods: of tracking.
-      slide_frames: of the slide that shear is read on.
-      ball_presses: that the calibration of depth is made with.
-      pictures: of each folder, for the recognition of marker gels.
-      seed: the first one.
-    """
-
-    data_dir: pathlib.Path | None = None
+    data_dir: pathlib.Path | None = None  # folder of the recordings; `None` for generated gels alone
     gels: int = 3
-    seeds: int = 2
-    methods: tuple[str, ...] = METHODS
-    slide_frames: int = 36
-    ball_presses: int = 24
-    pictures: int = 60
-    seed: int = 900
+    seeds: int = 2  # motions of each gel, and presses under each level for depth
+    methods: tuple[str, ...] = METHODS  # of tracking
+    slide_frames: int = 36  # of the slide that shear is read on
+    ball_presses: int = 24  # that the calibration of depth is made with
+    pictures: int = 60  # of each folder, for the recognition of marker gels
+    seed: int = 900  # the first one
 
     def __post_init__(self) -> None:
         at_least(self, 1, "gels", "seeds", "pictures")

@@ -74,27 +74,20 @@ _LIMITS = "Probes alone, on that partition too.  To have touched the object befo
 class PhysiclearStudy:
     """Training, validation, and objects left out."""
 
-    data_dir: Path | None = None
-    """Folder with labels.json and videos/; needed to train."""
+    data_dir: Path | None = None  # folder with labels.json and videos/; needed to train
     predict: tuple[Path, ...] = ()
     """A folder of videos to answer for one by one, or videos of one object, instead of validating."""
-    out: Path | None = None
-    """Where the answers go, as JSON."""
+    out: Path | None = None  # where the answers go, as JSON
     policy: Path | None = None
     """The trained policy; by default that in the cache, which is trained first where data_dir is given."""
-    objects: int | None = None
-    """Labelled objects to use; all by default."""
-    frames: int = 8
-    """Frames in contact that are described of each video."""
+    objects: int | None = None  # labelled objects to use; all by default
+    frames: int = 8  # frames in contact that are described of each video
     folds: int = 10
-    seeds: tuple[int, ...] = tuple(range(1001, 1009))
-    """Of the partitions into folds, and of the training on each."""
-    ablations: bool = True
-    """Whether variants of the policy are trained too."""
+    seeds: tuple[int, ...] = tuple(range(1001, 1009))  # of the partitions into folds, and of the training on each
+    ablations: bool = True  # whether variants of the policy are trained too
     scenes: SceneConfig = SceneConfig(objects=800, sites=1)
     """Scenes that are generated for training, in addition to the videos."""
-    scene_sets: int = 3
-    """Sets of them, of consecutive seeds, whose probes are averaged."""
+    scene_sets: int = 3  # sets of them, of consecutive seeds, whose probes are averaged
     learn: LearnConfig = LearnConfig()
 
 

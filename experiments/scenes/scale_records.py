@@ -58,14 +58,10 @@ class AssumedMachine:
     """The machine that is assumed: nothing of it is measured."""
 
     cores: int = 16
-    hourly_price: float = 0.5
-    """Of a machine."""
-    bandwidth_gb_s: float = 1.0
-    """To the store, of a machine."""
-    latency_ms: float = 30.0
-    """Of a request."""
-    requests_per_s: float = 3500.0
-    """Uploads that the store takes under one prefix, from all machines."""
+    hourly_price: float = 0.5  # of a machine
+    bandwidth_gb_s: float = 1.0  # to the store, of a machine
+    latency_ms: float = 30.0  # of a request
+    requests_per_s: float = 3500.0  # uploads that the store takes under one prefix, from all machines
 
     @property
     def described(self) -> str:
@@ -85,8 +81,7 @@ class BillionConfig:
     publications: int = 50
     records: int = 10**9
     machines: tuple[int, ...] = (1, 10, 100, 1000)
-    batch: int = 64
-    """Contacts of the first batch, each in a shard of its own."""
+    batch: int = 64  # contacts of the first batch, each in a shard of its own
     machine: AssumedMachine = AssumedMachine()
 
 

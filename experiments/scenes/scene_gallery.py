@@ -38,25 +38,16 @@ UNITS = {"hardness": "MPa", "roughness": "mm", "protrusion": "mm", "elasticity":
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GalleryConfig:
-    """Sizes of the sheets.
+    """Sizes of the sheets."""
 
-    Args:
-      views: objects per material; the pictures of the last two show another material.
-      presses: objects that are pressed.
-      columns: frames per row of a touch.
-      varied: objects of two parts, and as many graded ones.
-      image_px: side of the sensors' pictures.
-      protocol: small enough to be planned at once, with every motion in it.
-      seed: of all objects.
-    """
-
-    views: int = 9
-    presses: int = 3
-    columns: int = 8
-    varied: int = 4
-    image_px: int = 112
+    views: int = 9  # objects per material; the pictures of the last two show another material
+    presses: int = 3  # objects that are pressed
+    columns: int = 8  # frames per row of a touch
+    varied: int = 4  # objects of two parts, and as many graded ones
+    image_px: int = 112  # side of the sensors' pictures
     protocol: SceneConfig = SceneConfig(objects=12, sequences=4 * 48, frames=24, contact_grid=48)
-    seed: int = 0
+    """Small enough to be planned at once, with every motion in it."""
+    seed: int = 0  # of all objects
 
 
 def run(config: GalleryConfig, context: Context) -> Results:
