@@ -170,7 +170,6 @@ def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Resul
     }
     parts = elsewhere.probe_variants() | (elsewhere.policy_variants() if config.ablations else {})
     score = lambda title, rows, note: score_table(title, rows, videos.label, videos.objects, note)
-    curve, curve_table = findings.sim_to_real(elsewhere)
     main = intervals(policy.levels, policy.truth, policy.owner)
     all_videos = intervals(pooled.levels, policy.truth, policy.owner)
     gain = findings.gains(policy, regression)
@@ -181,12 +180,12 @@ def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Resul
             score_table("Unseen objects", methods, policy.truth, policy.owner, "Mean over the partitions."),
             findings.partition_table(policy, pooled, config.seeds),
             findings.people_table(people(videos), videos),
-            curve_table,
+            findings.sim_to_real(elsewhere),
             score("What contributes", {name: choose(rows) for name, rows in parts.items()}, _ELSEWHERE),
             score("What limits", elsewhere.label_limits(), _LIMITS),
             findings.object_table(videos, policy, pooled),
         ),
-        pictures=(findings.abstention(policy), curve, findings.confusions(policy)),
+        pictures=(findings.abstention(policy), findings.confusions(policy)),
         settings=settings(config, policy, videos),
         data={
             "objects": len(np.unique(videos.objects)),
