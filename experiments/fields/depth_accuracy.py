@@ -6,8 +6,8 @@ Without a calibration the truth is known of analytic slopes, of presses at known
 import dataclasses
 import functools
 import pathlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,7 +22,7 @@ from sensors_io import quality
 from sensors_io.calibration import published
 from sensors_io.calibration.circles import align_circles, find_circles
 from sensors_io.calibration.generated_presses import fitted_optics, generated_presses, near_lamps
-from sensors_io.calibration.presses import BallPresses, Touches
+from sensors_io.calibration.presses import BallPresses
 from sensors_io.calibration.validate import BallErrors, score_ball, score_presses
 from sensors_io.fields.contact import ContactConfig, changed_contacts, steepest_change
 from sensors_io.fields.depth import DepthReader
@@ -87,51 +87,37 @@ def recorded_sections(root: pathlib.Path, folds: int, rounds: int, seed: int, co
     return parts
 
 
-class CalibrationFold(NamedTuple):
-    """Presses of a calibration with their touches; the others with theirs [n, 3], and their indices [n]."""
+def held_out_errors(
+    presses: BallPresses, folds: int, seed: int, context: Context
+) -> tuple[dict[str, BallErrors], dict[str, SlopeMap]]:
+    """Errors of every press by each of `MAPS` made without it; the maps of the first fold.
 
-    train: BallPresses
-    train_touches: Touches
-    rest: BallPresses
-    rest_touches: np.ndarray
-    rest_index: np.ndarray
-
-
-def folds_of(presses: BallPresses, folds: int, seed: int, context: Context) -> list[CalibrationFold]:
-    """Circles of each fold's training presses; those of the rest are found by the optics of the training presses."""
-    order, found = np.random.default_rng(seed).permutation(len(presses)), []
-    for k in context.each("finding circles", range(folds)):
+    The circles of a fold's training presses are found without labels, those of the rest by the optics of these.
+    """
+    order, first = np.random.default_rng(seed).permutation(len(presses)), dict[str, SlopeMap]()
+    rows = {kind: np.full((3, len(presses)), np.nan) for kind in MAPS}
+    for k in context.each("folds", range(folds)):
         out = order[k::folds]
         train, rest = presses.chosen(np.setdiff1d(order, out)), presses.chosen(out)
         circles = find_circles(train)
         touches = align_circles(rest, circles.optics).touches.stacked()
-        found.append(CalibrationFold(train, circles.touches, rest, touches, out))
-    return found
-
-
-def held_out_errors(
-    folds: Sequence[CalibrationFold], make: Callable[[BallPresses, Touches, int], SlopeMap], seed: int
-) -> BallErrors:
-    """Errors of every press by a map that was made without it."""
-    rows = np.full((3, sum(len(fold.rest_index) for fold in folds)), np.nan)
-    for fold in folds:
-        read = make(fold.train, fold.train_touches, seed)
-        for i, picture, touch in zip(fold.rest_index, fold.rest.pictures, fold.rest_touches, strict=True):
-            depth = depth_by(read, picture, fold.rest.mm_per_px)
-            rows[:, i] = *score_ball(depth, touch, fold.rest.radius_mm, fold.rest.mm_per_px), depth.max()
-    return BallErrors(depth_um=rows[0], radius_share=rows[1], tip_mm=rows[2])
+        maps = {kind: make(train, circles.touches, seed) for kind, make in MAPS.items()}
+        first = first or maps
+        for kind, read in maps.items():
+            for i, picture, touch in zip(out, rest.pictures, touches, strict=True):
+                depth = depth_by(read, picture, rest.mm_per_px)
+                rows[kind][:, i] = *score_ball(depth, touch, rest.radius_mm, rest.mm_per_px), depth.max()
+    errors = {kind: BallErrors(depth_um=um, radius_share=r, tip_mm=tip) for kind, (um, r, tip) in rows.items()}
+    return errors, first
 
 
 def held_out_section(
     presses: BallPresses, name: str, folds: int, rounds: int, seed: int, context: Context
 ) -> list[ReportPart]:
     """All maps on the presses of one real sensor."""
-    parts = folds_of(presses, folds, seed, context)
-    errors = {kind: held_out_errors(parts, make, seed) for kind, make in context.each("maps", MAPS.items())}
-    calls = {}
-    for kind, make in context.each("maps to time", MAPS.items()):
-        read = make(parts[0].train, parts[0].train_touches, seed)
-        calls[kind] = functools.partial(depth_by, read, presses.pictures[0], presses.mm_per_px)
+    errors, maps = held_out_errors(presses, folds, seed, context)
+    still, pitch = presses.pictures[0], presses.mm_per_px
+    calls = {kind: functools.partial(depth_by, read, still, pitch) for kind, read in maps.items()}
     ms = median_ms(calls, context.rounds("timing maps", rounds))
     figures = {kind: error.figures() for kind, error in errors.items()}
     own = figures[PACKAGE]
