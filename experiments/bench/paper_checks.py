@@ -19,8 +19,7 @@ Verdict = Literal["contradiction", "not given", "unsupported", "holds"]
 
 OURS = "Touch-R1-7B"
 
-SHARE_ROUNDING, LEVEL_ROUNDING = 0.05, 0.005
-"""Half of the last digit of a percentage, and of OMAE and ρ."""
+SHARE_ROUNDING, LEVEL_ROUNDING = 0.05, 0.005  # half of the last digit of a percentage, and of OMAE and ρ
 
 SOLVER_ERROR = 1e-6  # Points; a smaller miss counts as none
 

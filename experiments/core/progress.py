@@ -30,8 +30,7 @@ class Advance(Protocol):
     def __call__(self, steps: int = 1, note: str = "") -> None: ...
 
 
-ProgressCallback = Callable[[int, int], None]
-"""Called with the steps that are done, and the number of all steps."""
+ProgressCallback = Callable[[int, int], None]  # called with the steps that are done, and the number of all steps
 
 MB = 1_000_000
 

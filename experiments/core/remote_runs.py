@@ -16,8 +16,7 @@ from experiments.core.commands import print_error, print_lines
 from sensors_io.remote import Mirror, StoreError
 from touchr1_jax.training.checkpoint import CHECKSUMS
 
-EVERY_S = 60.0
-"""Between two copies: what a machine computed in the last minute before it is lost is computed again."""
+EVERY_S = 60.0  # between two copies: what a machine computed in the last minute before it is lost is computed again
 
 RESULTS = "results.json"
 _HALF = ".orbax-checkpoint-tmp"  # in the name of a checkpoint that is being written

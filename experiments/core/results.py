@@ -13,8 +13,7 @@ from touchr1_jax.bench.scoring import REPORTED
 
 SETTINGS = ("preset", "lr_scale")  # settings without which no report can be read
 
-Slot = tuple[int, int, str]
-"""Start, end and segment (`perceive`, `compare` or `conclude`) of a piece of a trace."""
+Slot = tuple[int, int, str]  # start, end and segment (`perceive`, `compare` or `conclude`) of a piece of a trace
 
 Cell = str | float | int | bool | None  # what a table holds; `None` where nothing was measured
 

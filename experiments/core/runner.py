@@ -82,8 +82,7 @@ OF_RUNNER = (
 
 MOST_OPTIONS, MOST_LETTERS = 10, 70  # of short help: options, and letters about a group
 
-COMPILED = "compiled"
-"""Folder of the cache for compiled programs, which later runs of the same shapes reuse."""
+COMPILED = "compiled"  # folder of the cache for compiled programs, which later runs of the same shapes reuse
 
 KNOWN_ERRORS = (
     runs.RunInUse,

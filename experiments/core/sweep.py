@@ -34,8 +34,7 @@ from sensors_io.errors import UserError
 from sensors_io.units import HERE, Launcher, LauncherError, UnitsError, WorkUnit, finish
 from touchr1_jax.bench.scoring import REPORTED
 
-LIST = "sweep.json"
-"""Units of a sweep, in its folder."""
+LIST = "sweep.json"  # units of a sweep, in its folder
 
 FOLDERS = "sweeps"  # folder of the sweeps in the folder of all runs
 
@@ -52,21 +51,13 @@ class SweepError(UserError, ValueError):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SweepUnit:
-    """One run of a sweep.
+    """One run of a sweep."""
 
-    Attributes:
-      digest: hash of scale and configuration, by which the run is found.
-      settings: varied option → value.
-      command: words of the command line after the name of the experiment.
-      home: folder of the runs that it becomes one of.
-      config: in JSON's types.
-    """
-
-    digest: str
-    settings: Mapping[str, str]
-    command: tuple[str, ...]
-    home: Path
-    config: Any
+    digest: str  # hash of scale and configuration, by which the run is found
+    settings: Mapping[str, str]  # varied option → value
+    command: tuple[str, ...]  # words of the command line after the name of the experiment
+    home: Path  # folder of the runs that it becomes one of
+    config: Any  # in JSON's types
 
     @property
     def directory(self) -> Path | None:

@@ -42,11 +42,9 @@ KINDS, MOTIONS, FRAMES = ("sphere", "rough", "patterned"), ("press", "slide_x", 
 """Objects, contacts and frames of the slides."""
 
 STRIDE, ROUNDS = 3, 9  # every how many-th frame is scored; rounds of timing
-ShearMethod = Callable[[Slide, int], np.ndarray]
-"""From a slide and the index of a frame to its shear [h, w, 2], mm."""
+ShearMethod = Callable[[Slide, int], np.ndarray]  # from a slide and the index of a frame to its shear [h, w, 2], mm
 
-ShearErrors = Mapping[str, Mapping[str, float]]
-"""Method → motion → root mean square distance from the true shear, µm."""
+ShearErrors = Mapping[str, Mapping[str, float]]  # method → motion → root mean square distance from the true shear, µm
 
 
 @functools.lru_cache(maxsize=32)

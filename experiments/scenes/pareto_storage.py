@@ -57,8 +57,7 @@ TRAINING_FPS, CORE_SHARE = 1600, 0.15
 NEED_FPS = TRAINING_FPS / CORE_SHARE
 """The rule for the default: frames a second that training reads, on this share of a core."""
 
-WHOLE_FRAMES = 48
-"""Frames of each video that are kept in full size."""
+WHOLE_FRAMES = 48  # frames of each video that are kept in full size
 
 _MIRROR, _LIGHT = {"mirror": 0.5, "turn": 0.75}, {"exposure_stops": 0.5, "white_balance_stops": 0.2}
 CHANGES: Mapping[str, AugmentConfig | None] = {
@@ -70,8 +69,7 @@ CHANGES: Mapping[str, AugmentConfig | None] = {
 }
 """Augmentations whose time is measured."""
 
-Rows = Mapping[str, Sequence[CodecMeasurement]]
-"""Kind of clips → codecs measured on them."""
+Rows = Mapping[str, Sequence[CodecMeasurement]]  # kind of clips → codecs measured on them
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

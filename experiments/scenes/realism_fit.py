@@ -205,8 +205,7 @@ def _light(texture: np.ndarray) -> Light:
 
 ELEVATIONS_DEG = (10.0, 20.0, 35.0)
 DIRECTIONS = 8
-REACH_MM = np.linspace(0.25, 4.0, 12)
-"""Distances along the ray to the lamp at which the gel may stand in its way."""
+REACH_MM = np.linspace(0.25, 4.0, 12)  # distances along the ray to the lamp at which the gel may stand in its way
 
 
 def shadow_gain(study: PressFit, context: Context) -> dict[str, float]:

@@ -41,8 +41,7 @@ from sensors_io.schema import SENSORS
 MOST_OPEN_S, MOST_MB, MOST_FIND_MS, MOST_GROWTH = 3.0, 500.0, 1.0, 1.5
 """Requirements on the index: to open it, its memory, a contact by key, publishing late over publishing early."""
 
-Units = Mapping[str, float]
-"""Measured figures by name: those of `measure_units`, or of `index_cost`."""
+Units = Mapping[str, float]  # measured figures by name: those of `measure_units`, or of `index_cost`
 
 TITLES = {
     "cpu_ms": "one core, ms", "bytes": "size, bytes", "sent": "requests to send", "read": "requests to read",

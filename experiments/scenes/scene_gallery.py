@@ -30,8 +30,7 @@ from sensors_io.scenes.protocol import contact_key, make_contact
 from sensors_io.schema import MATERIALS, SENSORS, Sequence
 
 VIEW_PX = 96
-ARROW = 4.0
-"""Length of an arrow over the displacement that it shows."""
+ARROW = 4.0  # length of an arrow over the displacement that it shows
 
 UNITS = {"hardness": "MPa", "roughness": "mm", "protrusion": "mm", "elasticity": "share", "friction": ""}
 

@@ -34,11 +34,9 @@ from experiments.scenes import realism_fit
 from sensors_io.scenes import fitting, photometric
 
 PATCH_PX = 32
-BANDS = ((1, 1), (2, 2), (3, 4), (5, 7), (8, 10), (11, 13), (14, 16))
-"""Waves per patch, first and last of each band."""
+BANDS = ((1, 1), (2, 2), (3, 4), (5, 7), (8, 10), (11, 13), (14, 16))  # waves per patch, first and last of each band
 
-RIDGE = 1e-3
-"""Penalty on the squared weights of the standardised statistics of patches."""
+RIDGE = 1e-3  # penalty on the squared weights of the standardised statistics of patches
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -39,13 +39,11 @@ PAPER_RECORDS = PAPER_SEQUENCES * PAPER_FRAMES
 FEED_RATE, LARGE_RATE, WRITTEN_HOURS = 400, 150, 1.5
 """Requirements: records a second as a feed of ordinary and of large pictures; hours to write the paper's set."""
 
-KILLS, KILLED_RECORDS = 5, 20_000
-"""Requirements on the killed writer: kills, records."""
+KILLS, KILLED_RECORDS = 5, 20_000  # requirements on the killed writer: kills, records
 
 ORDINAL = ("hardness", "roughness", "protrusion")
 
-Parts = Mapping[str, Mapping[str, float]]
-"""Sensor → part of the work → milliseconds of one core a record."""
+Parts = Mapping[str, Mapping[str, float]]  # sensor → part of the work → milliseconds of one core a record
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
