@@ -16,8 +16,10 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from experiments.core.results import Requirement, Table, at_least, at_most, named_table
+from experiments.core.context import Context
+from experiments.core.results import Table, at_least, at_most, named_table
 from experiments.faults.replayed_camera import NoiseCamera
+from experiments.fields.sections import ReportPart
 from sensors_io.clock import NS_PER_S
 from sensors_io.devices.bridge import BridgeConfig
 from sensors_io.devices.errors import DeviceLostError
@@ -154,39 +156,43 @@ def bridged(count: int) -> BridgeTransfer:
     )
 
 
-def requirements(views: Sequence[ViewedRecording], transfer: BridgeTransfer) -> tuple[Requirement, ...]:
-    """Bounds on losses, on the age of pictures and on the rate of the bridge."""
+def viewing_section(
+    camera: NoiseCamera, seconds: float, browsers: Sequence[int], frames: int, context: Context
+) -> list[ReportPart]:
+    """Recordings of some seconds that so many browsers watch in turn; so many pictures through a bridge."""
+    watched = context.each("watched recordings", (None, *browsers))
+    views = [viewed(camera, seconds, number) for number in watched]
+    transfer, most = bridged(frames), views[-1]
     oldest = max(float(np.quantile(w.ages_s, 0.95)) for w in views if len(w.ages_s))
-    return (
+    times = dict.fromkeys(("age, median", "age, p95", "look, p99", "look, longest"), "ms")
+    return [
+        f"Watched by {most.name}, a recording loses {most.lost} of {most.written} samples; a bridge carries "
+        f"{transfer.rate_hz:.0f} pictures a second.",
         at_most("samples lost while watched", sum(w.lost for w in views), 0),
         at_most("age of what a browser shows, p95, worst", 1e3 * oldest, 150, "ms"),
         at_least("pictures of 640 × 480 through a bridge", transfer.rate_hz, FASTEST_HZ, "Hz"),
-    )
-
-
-def viewing_table(views: Sequence[ViewedRecording]) -> Table:
-    """Ages of the pictures in browsers, and times between two looks of the recorder at its device."""
-    times = dict.fromkeys(("age, median", "age, p95", "look, p99", "look, longest"), "ms")
-    return named_table(
-        "A recording that is watched",
-        [
-            {
-                "watched by": view.name, "shown": None if np.isnan(view.shown_hz) else view.shown_hz,
-                "age, median": _quantile_ms(view.ages_s, 0.5), "age, p95": _quantile_ms(view.ages_s, 0.95),
-                "look, p99": _quantile_ms(view.looks_s, 0.99), "look, longest": _quantile_ms(view.looks_s, 1.0),
-                "recorded": view.written, "lost": view.lost,
-            }
-            for view in views
-        ],
-        formats=dict.fromkeys(times, ".1f") | {"shown": ".1f", "age, median": ".0f", "age, p95": ".0f"},
-        units={"shown": "Hz"} | times,
-        meanings={
-            "shown": "states that one browser shows",
-            "age, median": "of all panels when the last is there",
-            "look, p99": "between two looks of the recorder",
-        },
-        note="Camera, recorder, server and browsers share the cores of the run; four panels a page.",
-    )  # fmt: skip
+        named_table(
+            "A recording that is watched",
+            [
+                {
+                    "watched by": view.name, "shown": None if np.isnan(view.shown_hz) else view.shown_hz,
+                    "age, median": _quantile_ms(view.ages_s, 0.5), "age, p95": _quantile_ms(view.ages_s, 0.95),
+                    "look, p99": _quantile_ms(view.looks_s, 0.99), "look, longest": _quantile_ms(view.looks_s, 1.0),
+                    "recorded": view.written, "lost": view.lost,
+                }
+                for view in views
+            ],
+            formats=dict.fromkeys(times, ".1f") | {"shown": ".1f", "age, median": ".0f", "age, p95": ".0f"},
+            units={"shown": "Hz"} | times,
+            meanings={
+                "shown": "states that one browser shows",
+                "age, median": "of all panels when the last is there",
+                "look, p99": "between two looks of the recorder",
+            },
+            note="Camera, recorder, server and browsers share the cores of the run; four panels a page.",
+        ),
+        bridge_table(transfer),
+    ]  # fmt: skip
 
 
 def bridge_table(transfer: BridgeTransfer) -> Table:

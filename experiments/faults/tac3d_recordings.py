@@ -11,8 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from experiments.core.results import Requirement, Table, at_most, named_table
+from experiments.core.context import Context
+from experiments.core.results import Table, at_most, named_table
 from experiments.core.timing import interleaved
+from experiments.fields.sections import ReportPart
 from sensors_io.clock import NS_PER_S, JumpingClock
 from sensors_io.devices import tac3d_messages
 from sensors_io.devices.intake import Counts, Intake
@@ -156,18 +158,31 @@ def _decode_by_yaml(layout: bytes, data: bytes) -> Mapping[str, np.ndarray]:
     return arrays
 
 
-def requirements(checks: Sequence[RecordingCheck], decode: Mapping[str, np.ndarray]) -> tuple[Requirement, ...]:
-    """Bounds on the time of a message and on the errors of the reader on the vendor's recordings."""
-    speed = at_most("Tac3D message decoded", float(np.median(decode[CACHED])), 0.05, "ms")
-    if not checks:
-        return (speed,)
-    off = sum(abs(c.missing - c.counts.missing) for c in checks)
-    gap = max(abs(c.gap_s - c.read_gap_s) for c in checks)
-    return (
-        speed,
-        at_most("Tac3D recordings: missing indices not counted", off, 0),
-        at_most("Tac3D recordings: largest gap off by", 1e3 * gap, 0.001, "ms"),
-    )
+def recording_section(data_dir: pathlib.Path | None, rounds: int, context: Context) -> list[ReportPart]:
+    """Time of a message by every method; gaps and lateness of the vendor's recordings, where they are given."""
+    paths = recordings(data_dir)
+    checks = [check(path) for path in context.each("recordings", paths)]
+    decode = decode_ms(message(paths[0] if paths else None), context.rounds("timing decoders", rounds))
+    cached = float(np.median(decode[CACHED]))
+    parts: list[ReportPart] = [
+        f"A Tac3D message decodes in {cached:.4f} ms.",
+        at_most("Tac3D message decoded", cached, 0.05, "ms"),
+    ]
+    if checks:
+        off = sum(abs(c.missing - c.counts.missing) for c in checks)
+        gap = max(abs(c.gap_s - c.read_gap_s) for c in checks)
+        parts += [
+            at_most("Tac3D recordings: missing indices not counted", off, 0),
+            at_most("Tac3D recordings: largest gap off by", 1e3 * gap, 0.001, "ms"),
+            recording_table(checks),
+        ]
+    rows = [
+        {"method": name, "median": m, "p95": float(np.quantile(ms, 0.95)), "against cached": m / cached}
+        for name, ms in decode.items()
+        if (m := float(np.median(ms)))
+    ]
+    formats, units = {"median": ".4f", "p95": ".4f", "against cached": ".1f"}, {"median": "ms", "p95": "ms"}
+    return [*parts, named_table("Time to decode one Tac3D message", rows, formats=formats, units=units)]
 
 
 def recording_table(checks: Sequence[RecordingCheck]) -> Table:
@@ -192,15 +207,3 @@ def recording_table(checks: Sequence[RecordingCheck]) -> Table:
             "late, median": "arrival after the stamp by running minimum",
         },
     )  # fmt: skip
-
-
-def decoder_table(decode: Mapping[str, np.ndarray]) -> Table:
-    """Time of one message by every method."""
-    cached = np.median(decode[CACHED])
-    rows = [
-        {"method": name, "median": m, "p95": float(np.quantile(ms, 0.95)), "against cached": float(m / cached)}
-        for name, ms in decode.items()
-        if (m := float(np.median(ms)))
-    ]
-    formats = {"median": ".4f", "p95": ".4f", "against cached": ".1f"}
-    return named_table("Time to decode one Tac3D message", rows, formats=formats, units={"median": "ms", "p95": "ms"})
