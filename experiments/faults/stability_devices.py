@@ -2,13 +2,11 @@
 
     python -m experiments stability_devices [--data-dir DIR] [--scale smoke]
 
-The package's reader reads one hour of a 120 Hz camera in compressed time, with 2 % drops, duplicates, jitter, a clock
-that gains 50 ppm and three disconnects.  It reads with the device's counter, without it (it then estimates losses from
-timestamps and recognises duplicates by their pictures), and with a consumer too slow for its ring buffer.  Its counts
-are compared with the injected faults, and memory after a tenth of the hour with that at its end, once also Python's
-own.  In the vendor's Tac3D recordings in DIR/tac3d, the real gaps must be counted exactly.  The time to decode a
-message is measured, cached and by YAML if ruamel.yaml is installed.  Finally, a camera at its true rate is recorded
-while browsers display it, and a bridge transfers the pictures of a vendor's camera.
+The package's reader reads one hour of a 120 Hz camera in compressed time, with drops, duplicates, jitter, a clock that
+gains and three disconnects: with the device's counter, without it (losses are then estimated from timestamps), and with
+a consumer too slow for its ring buffer.  In the vendor's Tac3D recordings in DIR/tac3d the real gaps must be counted
+exactly, and the time to decode a message is measured, also by YAML if ruamel.yaml is installed.  Finally, a camera at
+its true rate is recorded while browsers display it, and a bridge transfers a vendor's pictures.
 
 Two minutes on one core (`smoke` twenty seconds).  Expected: with a counter every sample is accounted for; without one
 the estimate is off by one in a thousand of the losses until stamps jitter by a quarter of the period; memory stays

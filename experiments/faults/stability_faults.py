@@ -2,14 +2,11 @@
 
     make experiment EXP=stability_faults [ARGS="--scale smoke"]
 
-Four parts.  Kills: `kill -9` ends training at random moments, a quarter of them during start-up and the others spread
-over the whole run, and the run is continued until it is finished; logs, answers and the final state of every stage are
-compared bit by bit with those of an undisturbed run.  The networks are so small that the loop takes most of the time of
-a step.  The GRPO of a study, which starts in seconds, is killed 200 times; a complete study of supervised fine-tuning,
-GRPO and a baseline without touch is killed a few times.  Damage: every file of an unfinished run is damaged in four
-ways, and single bits are flipped in all files of an unfinished and a finished study and their caches; the files are
-read and the run is continued.  Bad input: about forty kinds through the public command lines.  Waiting: the share of a
-step that waits for data, at the sizes of the studies, on a CPU.
+Kills: `kill -9` ends training at random moments, a quarter of them during start-up, and the run is continued until it
+is finished; it is compared bit by bit with an undisturbed one.  The GRPO of a study is killed 200 times, a complete
+study a few times; their networks are so small that the loop takes most of the time of a step.  Damage: every file of an
+unfinished run, in four ways, and single bits in all files of a study and its cache.  Bad input: about forty kinds
+through the public command lines.  Waiting: the share of a step that waits for data, on a CPU.
 
 Cost: 111 minutes in the recorded run on one core of a busy machine, most of it the 200 kills; `--scale smoke` about
 a minute and a half.

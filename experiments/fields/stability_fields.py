@@ -2,14 +2,11 @@
 
     python -m experiments stability_fields --data-dir DIR [--scale smoke]
 
-Known motion on pictures of marker gels (generated ones without `--data-dir`), under seven stresses from harmless to
-hopeless: displacement, frame gaps, lost dots, noise, exposure down and up to saturation, contact at the border.  Shear
-is stressed on generated slides, by noise, lost nodes and a layer other than the assumed one; depth on generated presses
-of a ball, by noise, exposure, drifting lamps, contact at the border, too large and too steep.  A method fails if more
-than 5 % of its points are a pixel off, if the error of shear exceeds half of the shear, or that of depth a fifth of the
-press; the curves show where methods fail and whether a flag was set.  Two further tables count flags on real pictures,
-and bare gels taken for marker gels, in every folder of the data directory.  None of the tracker's settings was chosen
-on these pictures, motions or noise.
+Known motion on pictures of marker gels, generated ones without `--data-dir`; shear on generated slides; depth on
+generated presses of a ball; each under stresses from harmless to hopeless.  A method fails if more than 5 % of its
+points are a pixel off, if the error of shear exceeds half of the shear, or that of depth a fifth of the press.  Two
+further tables count flags on real pictures, and bare gels taken for marker gels.  None of the tracker's settings was
+chosen on these pictures, motions or noise.
 
 Six minutes on one core (`smoke` half a minute).  Expected: the package's tracker fails last and never without a flag;
 methods that match from frame to frame or to the nearest dot fail at half a pitch without a flag.

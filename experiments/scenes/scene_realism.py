@@ -13,9 +13,6 @@ Cost: a minute on two cores.
 Expected: pictures by lamps set by eye are always distinguished from real ones and deviate by 13 grey levels; those by
 fitted optics deviate by 2, most of it noise.  Shadows explain little of the rest.  The classifier still finds the fine
 texture of a pressed real gel, which a contact grid does not resolve.
-
-Sets of pictures are RGB uint8 [P, N, N, 3]; picture p of both sets shows the same scene, so that appearance alone
-differs.
 """
 
 import dataclasses

@@ -3,11 +3,10 @@
     python -m experiments throughput_scenes
     python -m experiments throughput_scenes --scale full      (feeds all 1.32 million records: about twenty minutes)
 
-Measures records a second, one record being one frame of one sensor with its picture and fields: as a feed without
-disk, at 112² and 448², over the protocol's mix of presses and motions; and as a written set, which is then made again
-by a process that is killed five times at random moments, and compared entry by entry, bit for bit.  Clock rates depend
-on other load on the machine, processor times hardly.  Reports the time of each part of a record, the machine's lower
-bound, the frames that the protocol left out, and the accuracy of labels predicted from force alone.
+A record is one frame of one sensor with its picture and fields.  They are fed without disk, at 112² and 448², and
+written; the set is made again by a process that is killed five times at random moments, and compared bit for bit.
+Clock rates depend on other load on the machine, processor times hardly.  The report also has the time of each part of a
+record, the machine's lower bound, the frames left out, and labels predicted from force alone.
 
 Cost: about four minutes on two cores; `--scale smoke` a minute and a half on one.
 
