@@ -168,7 +168,6 @@ def layer_section() -> list[ReportPart]:
         by_method = {name: _mean(by) for name, by in shear_errors(TAC3D, slides).items()}
         row = "unexplained over noise, layer model with all of the motion"
         means[f"{factor:g} × thick, ν {poisson:g}"] = by_method | {row: unexplained(TAC3D, slides)}
-    worst, baseline = (max(by[name] for by in means.values()) for name in (MAIN, BASELINE))
     ratio = max(by[MAIN] / by[BASELINE] for by in means.values())
     table = named_table(
         "Shear with wrong parameters of the gel (Tac3D, generated)",
@@ -179,8 +178,6 @@ def layer_section() -> list[ReportPart]:
         "leaves hardly more unexplained than the right one, so it cannot be noticed there.",
     )
     return [
-        "With a gel up to 30 % thicker or thinner than assumed, and a Poisson ratio of 0.45 where 0.48 is assumed, "
-        f"the error of shear is {worst:.1f} µm at worst, with Helmholtz–Hodge {baseline:.1f} µm.",
         at_most("shear error over Helmholtz–Hodge's, worst wrong layer", ratio, 1.0),
         table,
     ]

@@ -169,7 +169,6 @@ def dense_section(rounds: int, gels: Sequence[MarkerGel], context: Context) -> l
         content=speed_against_error(points, "error, px", None, legend=False),
     )
     return [
-        f"Between the markers the mean error of the spline is {error:.3f} px; it takes {spline_ms:.2f} ms.",
         at_most("dense field, mean error", error, 0.05, "px"),
         at_least("markers → dense field", 1e3 / spline_ms, 1000, "Hz"),
         table,
