@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -279,6 +279,22 @@ class Results:
             **{name: jsonable(getattr(self, name), where=name) for name in names},
             "config": description["config"],
         }
+
+
+ReportPart = str | Requirement | Table | Picture  # a sentence of the verdict, or something to show
+
+
+def assemble(parts: Iterable[ReportPart], settings: Mapping[str, Any], data: Mapping[str, Any] = {}) -> Results:
+    """Results of parts; those of one kind keep their order."""
+    every = tuple(parts)
+    return Results(
+        verdict=tuple(part for part in every if isinstance(part, str)),
+        requirements=tuple(part for part in every if isinstance(part, Requirement)),
+        tables=tuple(part for part in every if isinstance(part, Table)),
+        pictures=tuple(part for part in every if isinstance(part, Picture)),
+        settings=settings,
+        data=data,
+    )
 
 
 def from_json(found: Mapping[str, Any]) -> Results:

@@ -17,9 +17,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.results import Table, at_least, at_most, named_table
+from experiments.core.results import ReportPart, Table, at_least, at_most, named_table
 from experiments.faults.replayed_camera import NoiseCamera
-from experiments.fields.sections import ReportPart
 from sensors_io.clock import NS_PER_S
 from sensors_io.devices.bridge import BridgeConfig
 from sensors_io.devices.errors import DeviceLostError

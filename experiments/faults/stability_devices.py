@@ -23,13 +23,12 @@ import numpy as np
 
 from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context
-from experiments.core.results import Picture, Results, at_most, named_table
+from experiments.core.results import Picture, ReportPart, Results, assemble, at_most, named_table
 from experiments.core.runner import Experiment
 from experiments.core.text import plain
 from experiments.faults import live_viewing as viewing
 from experiments.faults import tac3d_recordings as tac3d
 from experiments.faults.replayed_camera import NoiseCamera, ReplayOutcome, replay_camera
-from experiments.fields.sections import ReportPart, assemble
 from sensors_io.devices.errors import OverloadWarning
 from sensors_io.devices.replay import Disconnect, Faults
 

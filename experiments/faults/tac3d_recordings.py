@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.results import Table, at_most, named_table
+from experiments.core.results import ReportPart, Table, at_most, named_table
 from experiments.core.timing import interleaved
-from experiments.fields.sections import ReportPart
 from sensors_io.clock import NS_PER_S, JumpingClock
 from sensors_io.devices import tac3d_messages
 from sensors_io.devices.intake import Counts, Intake

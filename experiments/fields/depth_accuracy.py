@@ -14,10 +14,9 @@ import numpy as np
 
 from experiments.core.charts import speed_against_error
 from experiments.core.context import Context
-from experiments.core.results import Cell, Column, Picture, Requirement, Table, at_least, at_most, named_table
+from experiments.core.results import Cell, Picture, ReportPart, Requirement, Table, at_least, at_most, named_table
 from experiments.core.timing import median_ms
 from experiments.fields.depth_methods import INTEGRATORS, MAPS, Integrator, SlopeMap, calibrated, depth_by
-from experiments.fields.sections import ReportPart
 from sensors_io import quality
 from sensors_io.calibration import published
 from sensors_io.calibration.circles import align_circles, find_circles
@@ -245,17 +244,24 @@ def scale_error(
 def integrator_section(rounds: Iterable[object]) -> list[ReportPart]:
     """Every integrator on every analytic surface, and its time."""
     surfaces = analytic_surfaces()
-    errors = {name: [scale_error(f, *surface) for surface in surfaces.values()] for name, f in INTEGRATORS.items()}
+    errors = {
+        name: {at: scale_error(f, *surface) for at, surface in surfaces.items()} for name, f in INTEGRATORS.items()
+    }
     slope_x, slope_y = (a.astype(np.float32) for a in surfaces["ball, centre"][1:])
     ms = median_ms({name: functools.partial(f, slope_x, slope_y, PITCH_MM) for name, f in INTEGRATORS.items()}, rounds)
-    worst = max(abs(scale) for scale, _ in errors["this, Neumann"])
-    columns = [Column(name="integrator")]
-    for name in surfaces:
-        columns += [Column(name=f"scale, {name}", unit="%", format="+.2f"), Column(name="rmse", unit="µm")]
-    table = Table(
-        title="Slopes to depth on analytic surfaces",
-        columns=(*columns, Column(name="time a frame", unit="ms", format=".2f")),
-        rows=tuple((name, *(value for pair in errors[name] for value in pair), ms[name]) for name in INTEGRATORS),
+    worst = max(abs(scale) for scale, _ in errors["this, Neumann"].values())
+    scales, rmses = ({at: f"{what}, {at}" for at in surfaces} for what in ("scale", "rmse"))
+    table = named_table(
+        "Slopes to depth on analytic surfaces",
+        [
+            {"integrator": name}
+            | {scales[at]: scale for at, (scale, _) in by_surface.items()}
+            | {rmses[at]: rmse for at, (_, rmse) in by_surface.items()}
+            | {"time a frame": ms[name]}
+            for name, by_surface in errors.items()
+        ],
+        formats=dict.fromkeys(scales.values(), "+.2f") | {"time a frame": ".2f"},
+        units=dict.fromkeys(scales.values(), "%") | dict.fromkeys(rmses.values(), "µm") | {"time a frame": "ms"},
         note="Other projects' integrators are reimplemented with the faults that they ship with.",
     )
     scale = at_most("scale of depth from analytic slopes, worst of centre and border", worst, MOST_SCALE, "%")

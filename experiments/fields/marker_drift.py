@@ -12,9 +12,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from experiments.core.results import Table, at_most, named_table
+from experiments.core.results import ReportPart, Table, at_most, named_table
 from experiments.fields.known_motion import NOISE_GREY, PEAK_PX, REST_PICTURES, GelCamera, MarkerGel, grey
-from experiments.fields.sections import ReportPart
 from experiments.fields.trackers import FOLLOWERS
 
 METHODS = ("this", "this, affine alone", "this, LK alone", "LK frame to frame")

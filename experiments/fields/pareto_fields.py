@@ -21,7 +21,7 @@ import pathlib
 from collections.abc import Callable
 
 from experiments.core.context import Context
-from experiments.core.results import Results
+from experiments.core.results import ReportPart, Results, assemble
 from experiments.core.runner import Experiment
 from experiments.fields.depth_accuracy import (
     contact_section,
@@ -33,7 +33,6 @@ from experiments.fields.depth_accuracy import (
 from experiments.fields.false_alarms import pattern_section
 from experiments.fields.known_motion import gels
 from experiments.fields.marker_drift import drift_section
-from experiments.fields.sections import ReportPart, assemble
 from experiments.fields.shear_accuracy import layer_section, shear_section
 from experiments.fields.tracking_accuracy import dense_section, marker_section
 

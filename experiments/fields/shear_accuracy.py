@@ -13,10 +13,9 @@ import numpy as np
 
 from experiments.core.charts import Point, speed_against_error
 from experiments.core.context import Context
-from experiments.core.results import Cell, Picture, Table, at_most, named_table
+from experiments.core.results import Cell, Picture, ReportPart, Table, at_most, named_table
 from experiments.core.timing import median_ms
 from experiments.fields.generated_slides import NODES, Slide, cached_slides, make_slides, node_grid, pressing
-from experiments.fields.sections import ReportPart
 from sensors_io.arrays import load_arrays
 from sensors_io.clock import NS_PER_S
 from sensors_io.fields import total_force

@@ -17,11 +17,10 @@ import itertools
 import pathlib
 
 from experiments.core.context import Context
-from experiments.core.results import Results
+from experiments.core.results import Results, assemble
 from experiments.core.runner import Experiment
 from experiments.fields.false_alarms import flag_section, pattern_section
 from experiments.fields.known_motion import gels
-from experiments.fields.sections import assemble
 from experiments.fields.stress import OURS, gathered, silent_frames, stress_section
 from experiments.fields.stressed_readings import DEPTH, SHEAR, TRACKING, attempt_depth, attempt_shear, attempt_tracking
 from touchr1_jax.validation import at_least

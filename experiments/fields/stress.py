@@ -7,9 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from experiments.core.charts import Panel, Rule, Series, draw
-from experiments.core.results import Picture, Table, at_most, named_table
+from experiments.core.results import Picture, ReportPart, Table, at_most, named_table
 from experiments.core.text import number
-from experiments.fields.sections import ReportPart
 from sensors_io.fields.deformation import LOST_SHARE
 from sensors_io.schema import Flag
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from experiments.core.charts import Point, speed_against_error
 from experiments.core.context import Context
-from experiments.core.results import Cell, Column, Picture, Table, at_least, at_most
+from experiments.core.results import Cell, Column, Picture, ReportPart, Table, at_least, at_most
 from experiments.core.timing import median_ms
 from experiments.fields.known_motion import (
     FIRST_SEED,
@@ -20,7 +20,6 @@ from experiments.fields.known_motion import (
     MarkerGel,
     grey,
 )
-from experiments.fields.sections import ReportPart
 from experiments.fields.trackers import FLOWS, FOLLOWERS, Follower
 from sensors_io.fields.deformation import DeformationReader
 from sensors_io.fields.spline import Densifier
