@@ -1,22 +1,21 @@
 """The vendor's Tac3D recordings: the gaps that the reader counts in them, and the time to decode their messages."""
 
-import dataclasses
 import functools
 import importlib.util
 import pathlib
 import struct
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.results import ReportPart, Table, at_most, named_table
+from experiments.core.results import ReportPart, at_most, named_table
 from experiments.core.timing import interleaved
 from sensors_io.clock import NS_PER_S, JumpingClock
 from sensors_io.devices import tac3d_messages
-from sensors_io.devices.intake import Counts, Intake
+from sensors_io.devices.intake import Intake
 from sensors_io.devices.reader import Pump, ReaderConfig
 from sensors_io.devices.replay import Replay
 from sensors_io.devices.sources import Tac3dRecording
@@ -31,20 +30,6 @@ _PART_BYTES = 1400  # of a packet: below the Ethernet's 1500
 _REPEATS = 20  # decodings in a round of timing
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RecordingCheck:
-    """One recording, through the reader and by its arrays alone."""
-
-    name: str
-    frames: int
-    missing: int  # missing indices, by the arrays
-    gap_s: float  # largest time between two frames, by the arrays
-    counts: Counts  # of the reader
-    read_gap_s: float  # largest time between two samples of the reader
-    late_s: np.ndarray
-    """Of arrival after the mapped stamps, median and largest, [2]; NaN where arrival was not recorded."""
-
-
 def recordings(data_dir: pathlib.Path | None) -> list[pathlib.Path]:
     """The vendor's recordings below a directory, which must hold some."""
     if data_dir is None:
@@ -57,8 +42,11 @@ def recordings(data_dir: pathlib.Path | None) -> list[pathlib.Path]:
     return found
 
 
-def check(path: pathlib.Path) -> RecordingCheck:
-    """Replay a recording through a reader in compressed time, and count its gaps by its arrays too."""
+def check(path: pathlib.Path) -> dict[str, Any]:
+    """Replay a recording through a reader in compressed time, and count its gaps, in ms, by its arrays too.
+
+    It is late by the time of arrival after the mapped stamp, `None` where arrival was not recorded.
+    """
     truth = tac3d_messages.load_recording(path)
     clock = JumpingClock()
     intake = Intake(capacity=len(truth.index) + 1, clock=clock)
@@ -70,15 +58,17 @@ def check(path: pathlib.Path) -> RecordingCheck:
     while intake.counts.waiting:
         times.append(intake.next(0.0).device_time_ns or 0)
     present = set(truth.index.tolist())
-    return RecordingCheck(
-        name=path.stem,
-        frames=len(truth.index),
-        missing=sum(i not in present for i in range(int(truth.index[0]), int(truth.index[-1]) + 1)),
-        gap_s=float(np.diff(truth.send_time_s).max()),
-        counts=intake.counts,
-        read_gap_s=float(np.diff(times).max()) / NS_PER_S,
-        late_s=_lateness_s(truth),
-    )
+    late_ms = [None if np.isnan(late) else 1e3 * float(late) for late in _lateness_s(truth)]
+    return {
+        "recording": path.stem,
+        "frames": len(truth.index),
+        "missing": sum(i not in present for i in range(int(truth.index[0]), int(truth.index[-1]) + 1)),
+        "counted": intake.counts.missing,
+        "largest gap": 1e3 * float(np.diff(truth.send_time_s).max()),
+        "as seen": 1e3 * float(np.diff(times).max()) / NS_PER_S,
+        "late, median": late_ms[0],
+        "late, worst": late_ms[1],
+    }
 
 
 def _lateness_s(recording: tac3d_messages.Tac3dArrays) -> np.ndarray:
@@ -168,12 +158,23 @@ def recording_section(data_dir: pathlib.Path | None, rounds: int, context: Conte
         at_most("Tac3D message decoded", cached, 0.05, "ms"),
     ]
     if checks:
-        off = sum(abs(c.missing - c.counts.missing) for c in checks)
-        gap = max(abs(c.gap_s - c.read_gap_s) for c in checks)
+        off = sum(abs(row["missing"] - row["counted"]) for row in checks)
+        gap_ms = max(abs(row["largest gap"] - row["as seen"]) for row in checks)
+        gaps, lates = ("largest gap", "as seen"), ("late, median", "late, worst")
         parts += [
             at_most("Tac3D recordings: missing indices not counted", off, 0),
-            at_most("Tac3D recordings: largest gap off by", 1e3 * gap, 0.001, "ms"),
-            recording_table(checks),
+            at_most("Tac3D recordings: largest gap off by", gap_ms, 0.001, "ms"),
+            named_table(
+                "The vendor's Tac3D recordings",
+                checks,
+                formats=dict.fromkeys(gaps, ".3f") | dict.fromkeys(lates, ".1f"),
+                units=dict.fromkeys([*gaps, *lates], "ms"),
+                meanings={
+                    "missing": "by the arrays",
+                    "counted": "by the reader",
+                    "late, median": "arrival after the stamp by running minimum",
+                },
+            ),
         ]
     rows = [
         {"method": name, "median": m, "p95": float(np.quantile(ms, 0.95)), "against cached": m / cached}
@@ -182,27 +183,3 @@ def recording_section(data_dir: pathlib.Path | None, rounds: int, context: Conte
     ]
     formats, units = {"median": ".4f", "p95": ".4f", "against cached": ".1f"}, {"median": "ms", "p95": "ms"}
     return [*parts, named_table("Time to decode one Tac3D message", rows, formats=formats, units=units)]
-
-
-def recording_table(checks: Sequence[RecordingCheck]) -> Table:
-    """Gaps and lateness of the vendor's recordings."""
-    late = lambda seconds: None if np.isnan(seconds) else 1e3 * float(seconds)
-    gaps, lates = ("largest gap", "as seen"), ("late, median", "late, worst")
-    return named_table(
-        "The vendor's Tac3D recordings",
-        [
-            {
-                "recording": c.name, "frames": c.frames, "missing": c.missing, "counted": c.counts.missing,
-                "largest gap": 1e3 * c.gap_s, "as seen": 1e3 * c.read_gap_s, "late, median": late(c.late_s[0]),
-                "late, worst": late(c.late_s[1]),
-            }
-            for c in checks
-        ],
-        formats=dict.fromkeys(gaps, ".3f") | dict.fromkeys(lates, ".1f"),
-        units=dict.fromkeys([*gaps, *lates], "ms"),
-        meanings={
-            "missing": "by the arrays",
-            "counted": "by the reader",
-            "late, median": "arrival after the stamp by running minimum",
-        },
-    )  # fmt: skip
