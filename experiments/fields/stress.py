@@ -114,8 +114,8 @@ def _curves(field: StressedField, outcomes: StressOutcomes) -> bytes:
     panels = []
     for i, (stress, levels) in enumerate(field.stresses.items()):
         series = []
-        for method, by_level in reversed(outcomes.items()):  # the first method is drawn last, over the others
-            worst = [max(o.error for o in by_level[stress, level]) for level in levels]
+        for method in reversed(tuple(outcomes)):  # the first method is drawn last, over the others
+            worst = [max(o.error for o in outcomes[method][stress, level]) for level in levels]
             error, width = np.clip(worst, 0.01 * tolerance, 100 * tolerance), 2.4 if method == first else 1.1
             series.append(Series(method, x=range(len(levels)), y=error, marker="", width=width))
         panel = Panel(

@@ -175,8 +175,9 @@ def field_picture(depth_mm: np.ndarray, displacement_mm: np.ndarray, top_mm: flo
     cell = picture.shape[0] / depth_mm.shape[0]
     for row, column in np.ndindex(*depth_mm.shape):
         start = (np.array([column, row]) + 0.5) * cell
-        ends = np.rint([start, start + ARROW * cell * displacement_mm[row, column]]).astype(int).tolist()
-        cv2.line(picture, *ends, (255, 255, 255), 2, cv2.LINE_AA)
+        end = start + ARROW * cell * displacement_mm[row, column]
+        begin, tip = np.rint([start, end]).astype(int).tolist()
+        cv2.line(picture, begin, tip, (255, 255, 255), 2, cv2.LINE_AA)
     return picture
 
 
