@@ -50,10 +50,8 @@ Records = tyro.conf.Positional[Path]
 class FromRecords:
     """Questions about records; the same records, quota and seed give the same questions."""
 
-    records: Records
-    """Directory of the records; the questions are about objects of their test split."""
-    out: Path
-    """File to write, JSON Lines."""
+    records: Records  # directory of the records; the questions are about objects of their test split
+    out: Path  # file to write, JSON Lines
     quota: Quota = Quota()
     seed: int = 0
 
@@ -92,8 +90,7 @@ class Accept(FromRecords):
     Removed candidates are written next to it, to a file that ends in .rejected.jsonl.
     """
 
-    candidates: tyro.conf.Positional[Path]
-    """File of the candidates, JSON Lines."""
+    candidates: tyro.conf.Positional[Path]  # file of the candidates, JSON Lines
 
     def run(self) -> int:
         source = self.source()
@@ -112,12 +109,10 @@ class Score:
     """
 
     items: tyro.conf.Positional[Path]
-    answers: tyro.conf.Positional[tuple[Path, ...]]
-    """Files of answers, JSON Lines, one for each model."""
+    answers: tyro.conf.Positional[tuple[Path, ...]]  # files of answers, JSON Lines, one for each model
     by_sight: Path | None = None
     """File of the answers given the picture alone, which define which questions are a conflict."""
-    cache_dir: Path = Path("data")
-    """Folder that keeps the scores."""
+    cache_dir: Path = Path("data")  # folder that keeps the scores
     launcher: Annotated[Launcher, tyro.conf.arg(name="")] = HERE
 
     def run(self) -> int:
@@ -138,8 +133,7 @@ class AnnotateSheets:
     """Write a blank sheet for each of two annotators, the objects in an order of its own."""
 
     records: Records
-    out: Path
-    """Folder for the sheets, a.csv and b.csv."""
+    out: Path  # folder for the sheets, a.csv and b.csv
     seed: int = 0
 
     def run(self) -> int:
@@ -157,8 +151,7 @@ class Annotate:
     """
 
     records: Records
-    folder: tyro.conf.Positional[Path]
-    """Folder of the sheets; the labels are written to labels.json in it."""
+    folder: tyro.conf.Positional[Path]  # folder of the sheets; the labels are written to labels.json in it
 
     def run(self) -> int:
         store = RecordStore(self.records)
@@ -192,8 +185,7 @@ class AuditSheet:
 
     items: tyro.conf.Positional[Path]
     records: Records
-    out: Path
-    """File for the sheet; its key is written next to it, to a file that ends in .key.json."""
+    out: Path  # file for the sheet; its key is written next to it, to a file that ends in .key.json
     count: int = 2000
     seed: int = 0
 
@@ -213,10 +205,8 @@ class Audit:
     """Score filled-in sheets: the pass rates with intervals, and κ if two judges filled in the same sample."""
 
     items: tyro.conf.Positional[Path]
-    key: tyro.conf.Positional[Path]
-    """The key of the sample."""
-    sheets: tyro.conf.Positional[tuple[Path, ...]]
-    """One or two filled-in sheets."""
+    key: tyro.conf.Positional[Path]  # the key of the sample
+    sheets: tyro.conf.Positional[tuple[Path, ...]]  # one or two filled-in sheets
 
     def run(self) -> int:
         if not 1 <= len(self.sheets) <= 2:

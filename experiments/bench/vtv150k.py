@@ -17,7 +17,6 @@ reaches guessing.
 """
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -59,11 +58,9 @@ class VTVProtocolConfig:
 
     scenes: SceneConfig = SceneConfig(objects=400, sequences=4 * 2800, frames=24, image_px=56, contact_grid=32)
     """Its protocol moves only objects that bear it: about three in ten have both motions, the flat ones more often."""
-    moments: int = 8
-    """Frames of a motion that are read."""
+    moments: int = 8  # frames of a motion that are read
     probe: ProbeConfig = ProbeConfig()
-    questions: int = 960
-    """Questions of each task that compares recordings."""
+    questions: int = 960  # questions of each task that compares recordings
 
 
 class RecordingFeatures(NamedTuple):
@@ -92,11 +89,7 @@ def run(config: VTVProtocolConfig, context: Context) -> Results:
     }
     return Results(
         verdict=verdict(scored),
-        tables=(
-            score_table(scored),
-            task_table({task: len(score.values) for task, score in scores[FUSED].items()}, scored[FUSED]),
-            differences_table(DIFFERENCES),
-        ),
+        tables=(score_table(scored), differences_table(DIFFERENCES)),
         pictures=(
             Picture(
                 name="vtv",
@@ -109,7 +102,11 @@ def run(config: VTVProtocolConfig, context: Context) -> Results:
         settings={
             "recordings": f"{len(made.objects)} objects, {' and '.join(MOTIONS)} each, by {len(SENSORS)} sensors"
         },
-        data={"objects": len(made.objects), "level shares (%)": shares},
+        data={
+            "objects": len(made.objects),
+            "level shares (%)": shares,
+            "questions": {task: len(score.values) for task, score in scores[FUSED].items()},
+        },
     )
 
 
@@ -187,6 +184,7 @@ def score_table(scored: Scored) -> Table:
         meanings={
             "Average": "plain mean of the nine",
             span: "of the average, whole objects resampled; the paper gives none",
+            **{column: MEANINGS[task] for task, column in zip(VTV, paper.VTV_COLUMNS, strict=True)},
         },
         note="Percent right. Compare directions, not values: other objects, other questions, no language model. The "
         "paper's caption says that SOI is no percentage, but its averages take it as one.",
@@ -205,27 +203,6 @@ MEANINGS: Mapping[str, str] = {
     "osc": "which recording is which of three named objects",
     "tsa": "which of two suits a scenario",
 }
-
-
-def task_table(counts: Mapping[str, int], scored: Mapping[str, Interval]) -> Table:
-    """Meaning, questions and chance of each task, and the interval that the benchmark's size would give its share."""
-    width, deviation = f"± of {paper.VTV_ITEMS}", lambda p: math.sqrt(p * (1 - p) / paper.VTV_ITEMS)
-    rows: list[dict[str, Cell]] = [
-        {
-            "task": name,
-            "asks for": MEANINGS[task],
-            "questions": counts[task],
-            "chance": CHANCE[task],
-            width: 196 * deviation(scored[task].mean / 100),
-        }
-        for task, name in zip(VTV, paper.VTV_COLUMNS, strict=True)
-    ]
-    meaning = (
-        "half the 95 % interval of the first row's share if it were measured on the benchmark's number of questions "
-        "of a property, taken as independent"
-    )
-    formats, units = {"chance": ".1f", width: ".1f"}, {"chance": "%", width: "points"}
-    return named_table("Tasks", rows, formats=formats, units=units, meanings={width: meaning})
 
 
 DIFFERENCES = (

@@ -46,61 +46,39 @@ BEATEN = "×: dominated by another"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Rule:
-    """A bound: a vertical line at `x`, a level line at `y`; with both, the corner that must be kept.
+    """A bound: a vertical line at `x`, a level line at `y`; with both, the corner that must be kept."""
 
-    Args:
-      x, y: in data coordinates.
-      name: in the legend; none by default.
-      line, colour, width: of the line; width in points.
-      keep: with x and y, the side of the level line that is inside.
-    """
-
-    x: float | None = None
+    x: float | None = None  # in data coordinates, as y
     y: float | None = None
-    name: str = ""
+    name: str = ""  # in the legend; none by default
     line: str = ":"
     colour: str = "black"
-    width: float = 1.0
-    keep: Literal["below", "above"] = "below"
+    width: float = 1.0  # of the line, points
+    keep: Literal["below", "above"] = "below"  # with x and y, the side of the level line that is inside
 
 
 @dataclasses.dataclass(frozen=True)
 class Series:
-    """Points of a panel; a number that is missing is NaN.
+    """Points of a panel; a number that is missing is NaN."""
 
-    Args:
-      name: in the legend; none by default.
-      x, y: positions [N]; in a panel of rows, `y` defaults to the rows from the top.
-      low, high: ends of the interval of each y, in a panel of rows of each x; one alone reaches from the point.
-      band: whether the intervals are one filled band.
-      bar: in a panel of rows, bars from 0 to `x`; several series are side by side, on a `stacked` panel end to end.
-      line: matplotlib's style; "" for points alone, which panels of rows always have.
-      marker: matplotlib's; `None` for the name's own, "" for none.
-      colour: one, or one per point; `None` for the name's own.
-      size: area of a marker in points², one or one per point.
-      hollow: whether markers are outlines.
-      width, alpha: of the line (points) and its opacity.
-      shift: of all points across their rows, or along x, so that intervals do not cover each other.
-      labels: a name to write at each point.
-    """
-
-    name: str = ""
+    name: str = ""  # in the legend; none by default
     _: dataclasses.KW_ONLY
-    x: Values
+    x: Values  # positions [N]; in a panel of rows, `y` defaults to the rows from the top
     y: Values = ()
-    low: Values = ()
+    low: Values = ()  # ends of the interval of each y, in a panel of rows of each x; one alone reaches from the point
     high: Values = ()
-    band: bool = False
+    band: bool = False  # whether the intervals are one filled band
     bar: bool = False
-    line: Any = "-"
-    marker: str | None = None
-    colour: Any = None
-    size: float | Values = 28.0
-    hollow: bool = False
-    width: float = 1.5
+    """In a panel of rows, bars from 0 to `x`; several series are side by side, on a `stacked` panel end to end."""
+    line: Any = "-"  # matplotlib's style; "" for points alone, which panels of rows always have
+    marker: str | None = None  # matplotlib's; `None` for the name's own, "" for none
+    colour: Any = None  # one, or one per point; `None` for the name's own
+    size: float | Values = 28.0  # area of a marker in points², one or one per point
+    hollow: bool = False  # whether markers are outlines
+    width: float = 1.5  # of the line, points
     alpha: float = 1.0
-    shift: float = 0.0
-    labels: Sequence[str] = ()
+    shift: float = 0.0  # of all points across their rows, or along x, so that intervals do not cover each other
+    labels: Sequence[str] = ()  # a name to write at each point
 
 
 def estimates(name: str, found: Sequence[WithInterval], *, at: Values = (), **look: Any) -> Series:
@@ -112,42 +90,28 @@ def estimates(name: str, found: Sequence[WithInterval], *, at: Values = (), **lo
 
 @dataclasses.dataclass(frozen=True)
 class Panel:
-    """One pair of axes.
+    """One pair of axes."""
 
-    Args:
-      series: drawn in order.
-      title: above the panel.
-      x_label, y_label: with units.
-      x_scale, y_scale: "symlog" is linear up to `linear_to`, logarithmic beyond.
-      x_limits, y_limits: ends of the axes; an end that is `None` follows the data.
-      x_ticks, y_ticks: position → text; by default matplotlib's choice.
-      y_format: of its ticks, such as "{x:.0%}".
-      rules: bounds.
-      rows: names of rows from the top, in place of a y axis.
-      stacked: whether bars of several series are put end to end.
-      written: format of the figure at the end of each bar, such as ".2g"; none by default.
-      linear_to: see `x_scale`.
-      better: which x and which y are better; points with markers that another one dominates are crossed.
-    """
-
-    series: Sequence[Series]
+    series: Sequence[Series]  # drawn in order
     _: dataclasses.KW_ONLY
-    title: str = ""
-    x_label: str = ""
+    title: str = ""  # above the panel
+    x_label: str = ""  # with units
     y_label: str = ""
-    x_scale: Scale = "linear"
+    x_scale: Scale = "linear"  # "symlog" is linear up to `linear_to`, logarithmic beyond
     y_scale: Scale = "linear"
     x_limits: tuple[float | None, float | None] = (None, None)
     y_limits: tuple[float | None, float | None] = (None, None)
-    x_ticks: Mapping[float, str] | None = None
+    """Ends of the axes; an end that is `None` follows the data."""
+    x_ticks: Mapping[float, str] | None = None  # position → text; by default matplotlib's choice
     y_ticks: Mapping[float, str] | None = None
-    y_format: str = ""
+    y_format: str = ""  # of its ticks, such as "{x:.0%}"
     rules: Sequence[Rule] = ()
-    rows: Sequence[str] = ()
-    stacked: bool = False
-    written: str = ""
-    linear_to: float = 1.0
+    rows: Sequence[str] = ()  # names of rows from the top, in place of a y axis
+    stacked: bool = False  # whether bars of several series are put end to end
+    written: str = ""  # format of the figure at the end of each bar, such as ".2g"; none by default
+    linear_to: float = 1.0  # see `x_scale`
     better: tuple[Better, Better] | None = None
+    """Which x and which y are better; points with markers that another one dominates are crossed."""
 
 
 def draw(

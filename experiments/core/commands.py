@@ -76,10 +76,8 @@ def _defines_experiment(tree: ast.Module) -> bool:
 class ListCommand:
     """List every experiment by family with the cost and the result of its newest run; with a name, all its runs."""
 
-    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")] = ""
-    """An experiment."""
-    runs_dir: Path = Path("runs")
-    """Folder of all runs."""
+    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")] = ""  # an experiment
+    runs_dir: Path = Path("runs")  # folder of all runs
 
     def run(self, package: str) -> int:
         """Print the list and return the exit status."""
@@ -98,12 +96,9 @@ class ListCommand:
 class NewCommand:
     """Start an ablation from a template; with `--reward` also a reward and its test.  All of them run."""
 
-    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
-    """Of the experiment, and of the reward."""
-    reward: bool = False
-    """Make a reward of that name for the experiment to try."""
-    root: Path = runs.ROOT
-    """The checkout to write in."""
+    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]  # of the experiment, and of the reward
+    reward: bool = False  # make a reward of that name for the experiment to try
+    root: Path = runs.ROOT  # the checkout to write in
 
     def run(self, package: str) -> int:
         """Write the files, print the next steps, and return the exit status."""
@@ -127,10 +122,8 @@ class CompareCommand:
     """
 
     runs: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN RUN [RUN ...]")]
-    runs_dir: Path = Path("runs")
-    """Folder of all runs."""
-    most: int = 40
-    """Differing figures to show."""
+    runs_dir: Path = Path("runs")  # folder of all runs
+    most: int = 40  # differing figures to show
 
     def run(self, package: str) -> int:
         """Print the comparison and return the exit status."""
@@ -155,8 +148,7 @@ class ShowCommand:
 
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
     """An experiment with a run in experiments/recorded."""
-    runs_dir: Path = Path("runs")
-    """Folder of all runs."""
+    runs_dir: Path = Path("runs")  # folder of all runs
 
     def run(self, package: str) -> int:
         """Write the report, print its path and its verdict, and return the exit status."""

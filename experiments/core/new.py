@@ -11,8 +11,7 @@ import jinja2
 
 from experiments.core.artifacts import write_text
 
-DICTIONARY = Path("touchr1_jax/rewards/__init__.py")
-"""The file with an import and an entry for every reward."""
+DICTIONARY = Path("touchr1_jax/rewards/__init__.py")  # the file with an import and an entry for every reward
 
 EXAMPLES = Path("tests/touchr1_jax/rewards/examples.py")  # answers and targets of the tests of rewards
 _MAKER = "make_rewards"  # the function that returns the dictionary

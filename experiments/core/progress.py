@@ -6,17 +6,8 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
+from rich import progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.text import Text
 
 from experiments.core.text import duration
@@ -30,8 +21,7 @@ class Advance(Protocol):
     def __call__(self, steps: int = 1, note: str = "") -> None: ...
 
 
-ProgressCallback = Callable[[int, int], None]
-"""Called with the steps that are done, and the number of all steps."""
+ProgressCallback = Callable[[int, int], None]  # called with the steps that are done, and the number of all steps
 
 MB = 1_000_000
 
@@ -42,15 +32,10 @@ def in_megabytes(callback: ProgressCallback) -> ProgressCallback:
 
 
 class Loop:
-    """The progress of a loop.
+    """The progress of a loop of `total` steps; those that earlier sessions `completed` do not count into the rate.
 
-    Args:
-      title: of its bar.
-      total: steps of the whole loop.
-      completed: steps of earlier sessions; they do not count into the rate.
-      still: redraw with each step only, not ten times a second, which would take time from what is timed.
-      note: shown beside the bar until the first of its steps, such as "compiling".
-      clock: seconds.
+    A `still` bar is redrawn with each step only, not ten times a second, which would take time from what is timed.  A
+    note, such as "compiling", is shown until the first step.  The clock counts seconds.
     """
 
     def __init__(
@@ -159,24 +144,24 @@ def show_progress(
 def _bar(console: Console, loop: Loop, every_s: float) -> Iterator[Callable[[], None]]:
     del every_s
     columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
+        progress.TextColumn("{task.description}", markup=False),
+        progress.BarColumn(),
+        progress.MofNCompleteColumn(),
         RateColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}", style="dim", markup=False),
+        progress.TimeElapsedColumn(),
+        progress.TextColumn("left"),
+        progress.TimeRemainingColumn(),
+        progress.TextColumn("{task.fields[note]}", style="dim", markup=False),
     )
-    with Progress(*columns, console=console, auto_refresh=not loop.still) as bar:
+    with progress.Progress(*columns, console=console, auto_refresh=not loop.still) as bar:
         task = bar.add_task(loop.title, total=loop.total, completed=loop.completed, note=loop.note)
         yield lambda: bar.update(task, completed=loop.completed, note=loop.note, refresh=loop.still)
 
 
-class RateColumn(ProgressColumn):
+class RateColumn(progress.ProgressColumn):
     """Steps per second over the recent steps."""
 
-    def render(self, task: Task) -> Text:
+    def render(self, task: progress.Task) -> Text:
         """The rate, or nothing before the first step."""
         speed = task.finished_speed or task.speed
         return Text("" if speed is None else f"{speed:.3g}/s", style="progress.data.speed")

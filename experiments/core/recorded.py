@@ -23,11 +23,9 @@ from experiments.core.results import from_json
 from experiments.core.runs import ROOT, PastRun
 from experiments.core.text import number
 
-RECORDED = Path("experiments/recorded")
-"""Folder of the checkout with the run of each experiment that the README shows."""
+RECORDED = Path("experiments/recorded")  # folder of the checkout with the run of each experiment that the README shows
 
-RECORDED_RUN = "recorded"
-"""Name of a recorded run in place of a stamp, and so of the folder that `show` writes."""
+RECORDED_RUN = "recorded"  # name of a recorded run in place of a stamp, and so of the folder that `show` writes
 
 BEGIN, END = "<!-- results: `python -m experiments.core.recorded fill` writes this table -->", "<!-- /results -->"
 

@@ -16,8 +16,7 @@ from experiments.core.commands import print_error, print_lines
 from sensors_io.remote import Mirror, StoreError
 from touchr1_jax.training.checkpoint import CHECKSUMS
 
-EVERY_S = 60.0
-"""Between two copies: what a machine computed in the last minute before it is lost is computed again."""
+EVERY_S = 60.0  # between two copies: what a machine computed in the last minute before it is lost is computed again
 
 RESULTS = "results.json"
 _HALF = ".orbax-checkpoint-tmp"  # in the name of a checkpoint that is being written
@@ -25,15 +24,9 @@ _LOG = logging.getLogger(__name__)
 
 
 def run_at(url: str, name: str, execute: Callable[[Path], int]) -> int:
-    """Compute a run of an experiment in a folder that is copied to `url`/`name`; the exit code.
+    """Compute a run of an experiment in a folder that is copied to `url`/`name`; the exit code, which `execute` gives.
 
-    Args:
-      url: of all runs.
-      name: of the experiment.
-      execute: runs or continues in a folder of runs; returns the exit code.
-
-    Raises:
-      StoreError: before anything is computed, if the store cannot be read.
+    `StoreError` before anything is computed, if the store cannot be read.
     """
     runs_dir = Path(tempfile.mkdtemp(prefix="touchr1-runs-"))
     copier, ended = _Copier(Mirror(f"{url}/{name}"), runs_dir / name), threading.Event()

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -13,8 +13,7 @@ from touchr1_jax.bench.scoring import REPORTED
 
 SETTINGS = ("preset", "lr_scale")  # settings without which no report can be read
 
-Slot = tuple[int, int, str]
-"""Start, end and segment (`perceive`, `compare` or `conclude`) of a piece of a trace."""
+Slot = tuple[int, int, str]  # start, end and segment (`perceive`, `compare` or `conclude`) of a piece of a trace
 
 Cell = str | float | int | bool | None  # what a table holds; `None` where nothing was measured
 
@@ -85,15 +84,10 @@ def named_table(
     meanings: Mapping[str, str] = {},
     note: str = "",
 ) -> Table:
-    """A table from rows that name their cells; the first column names the row.
+    """A table from rows that name their cells, in the order in which they first do; a missing cell is `None`.
 
-    Args:
-      title, note: heading, and a sentence above the table.
-      rows: column → cell; columns are in the order in which rows first name them; a missing cell is `None`.
-      formats, units, meanings: column → format of its numbers (".3g" by default), unit, explanation.
-
-    Raises:
-      ResultsError: a format, unit or meaning of a column that no row names.
+    `formats` (".3g" by default), `units` and `meanings` are by column; `ResultsError` for one that no row names.  The
+    note is a sentence above the table.
     """
     names = list(dict.fromkeys(name for row in rows for name in row))
     for field, given in (("formats", formats), ("units", units), ("meanings", meanings)):
@@ -164,8 +158,7 @@ class Trace:
 
     text: str
     slots: tuple[Slot, ...]
-    right: bool | None = None
-    """Whether the answer concludes the true level; `None` where that is not known."""
+    right: bool | None = None  # whether the answer concludes the true level; `None` where that is not known
 
     def __post_init__(self) -> None:
         end = 0
@@ -177,39 +170,26 @@ class Trace:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RolloutExample:
-    """One answer of the report, with the touch that it is about.
-
-    Args:
-      arm, object_id: policy and object.
-      question, label, trace: text.
-      slots: the parsed pieces of the trace, in order and disjoint.
-      reward: the value of each term; `total` their weighted sum.
-      frames: sensor → uint8 [F, H, W, 3], RGB.
-      force_n: sensor → float [F, 3].
-      view: uint8 [H, W, 3] RGB picture of the object, or `None`.
-      fields: sensor → uint8 [H, W, 3], its fields at the strongest press, drawn.
-      instead: replacement of the touch → the answer to it.
-      others: other arm → its answer to the same question.
-      right: whether the answer concludes the true level; `None` where that is not known.
-      group: heading that it shares with its neighbours; none by default.
-    """
+    """One answer of the report, with the touch that it is about."""
 
     arm: str
     object_id: str
     question: str
     label: str
     trace: str
-    slots: tuple[Slot, ...]
-    reward: Mapping[str, float]
+    slots: tuple[Slot, ...]  # the parsed pieces of the trace, in order and disjoint
+    reward: Mapping[str, float]  # the value of each term; `total` their weighted sum
     total: float
-    frames: Mapping[str, np.ndarray]
-    force_n: Mapping[str, np.ndarray]
-    view: np.ndarray | None = None
+    frames: Mapping[str, np.ndarray]  # sensor → uint8 [F, H, W, 3], RGB
+    force_n: Mapping[str, np.ndarray]  # sensor → float [F, 3]
+    view: np.ndarray | None = None  # uint8 [H, W, 3] RGB picture of the object, or `None`
     fields: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    """Sensor → uint8 [H, W, 3], its fields at the strongest press, drawn."""
     instead: Mapping[str, Trace] = dataclasses.field(default_factory=dict)
-    others: Mapping[str, Trace] = dataclasses.field(default_factory=dict)
-    right: bool | None = None
-    group: str = ""
+    """Replacement of the touch → the answer to it."""
+    others: Mapping[str, Trace] = dataclasses.field(default_factory=dict)  # other arm → its answer to the same question
+    right: bool | None = None  # whether the answer concludes the true level; `None` where that is not known
+    group: str = ""  # heading that it shares with its neighbours; none by default
 
     def __post_init__(self) -> None:
         Trace(text=self.trace, slots=self.slots)
@@ -299,6 +279,22 @@ class Results:
             **{name: jsonable(getattr(self, name), where=name) for name in names},
             "config": description["config"],
         }
+
+
+ReportPart = str | Requirement | Table | Picture  # a sentence of the verdict, or something to show
+
+
+def assemble(parts: Iterable[ReportPart], settings: Mapping[str, Any], data: Mapping[str, Any] = {}) -> Results:
+    """Results of parts; those of one kind keep their order."""
+    every = tuple(parts)
+    return Results(
+        verdict=tuple(part for part in every if isinstance(part, str)),
+        requirements=tuple(part for part in every if isinstance(part, Requirement)),
+        tables=tuple(part for part in every if isinstance(part, Table)),
+        pictures=tuple(part for part in every if isinstance(part, Picture)),
+        settings=settings,
+        data=data,
+    )
 
 
 def from_json(found: Mapping[str, Any]) -> Results:

@@ -82,8 +82,7 @@ OF_RUNNER = (
 
 MOST_OPTIONS, MOST_LETTERS = 10, 70  # of short help: options, and letters about a group
 
-COMPILED = "compiled"
-"""Folder of the cache for compiled programs, which later runs of the same shapes reuse."""
+COMPILED = "compiled"  # folder of the cache for compiled programs, which later runs of the same shapes reuse
 
 KNOWN_ERRORS = (
     runs.RunInUse,
@@ -108,27 +107,20 @@ C = TypeVar("C")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Experiment(Generic[C]):
-    """A question, and the code that answers it.
+    """A question, and the code that answers it."""
 
-    Args:
-      name: the name of its module.
-      config: the default configuration, a frozen keyword-only dataclass.
-      run: computes the results; it skips stages for which `Context.done` is true and continues from checkpoints.
-      scales: further configurations by name, `smoke` for one that takes under two minutes.
-      curves: phase → scalars to draw; of a phase that is not named all, the first few while it runs.
-      needs: scale → accelerators that it needs; a scale that is not named runs on any machine.
-      quick: scales whose programs run so few times that they are compiled quickly.
-      spreads: whether its training runs on the devices of all processes; others use one device.
-    """
-
-    name: str
-    config: C
+    name: str  # the name of its module
+    config: C  # the default configuration, a frozen keyword-only dataclass
     run: Callable[[C, Context], Results]
+    """Computes the results; it skips stages for which `Context.done` is true and continues from checkpoints."""
     scales: Mapping[str, C] = dataclasses.field(default_factory=dict)
+    """Further configurations by name, `smoke` for one that takes under two minutes."""
     curves: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    """Phase → scalars to draw; of a phase that is not named all, the first few while it runs."""
     needs: Mapping[str, Accelerators] = dataclasses.field(default_factory=dict)
-    quick: tuple[str, ...] = ()
-    spreads: bool = False
+    """Scale → accelerators that it needs; a scale that is not named runs on any machine."""
+    quick: tuple[str, ...] = ()  # scales whose programs run so few times that they are compiled quickly
+    spreads: bool = False  # whether its training runs on the devices of all processes; others use one device
 
     def __post_init__(self) -> None:
         if "default" in self.scales:
@@ -212,11 +204,8 @@ def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> 
     """Resolve the command line: the runner's options and the overridden `.config`.
 
     The scale is picked out first, since it chooses the defaults that everything else overrides, and choices such as
-    `grpo.algorithm:dapo` are, since their options may stand anywhere; tyro refuses unknown ones.
-
-    Raises:
-      SystemExit: code 2 after the correction of a typo, 0 after help.
-      ValueError: a number that no scale has; what a class refuses itself.
+    `grpo.algorithm:dapo` are, since their options may stand anywhere; tyro refuses unknown ones.  `SystemExit` with
+    code 2 after the correction of a typo, 0 after help; `ValueError` for a number that a class or all scales refuse.
     """
     arguments = sorted(arguments, key=lambda word: not _chooses(word, experiment.config))
     configs, scale = experiment.configs(), "default"

@@ -175,21 +175,13 @@ def _describes_run(found: Any) -> bool:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PastRun:
-    """A run, read from its directory.
+    """A run, read from its directory."""
 
-    Attributes:
-      directory: `runs/NAME/STAMP`.
-      description: content of `config.json`.
-      seconds: wall time of all its sessions; `None` before the first one ended.
-      results: content of `results.json`; `None` while it is unfinished.
-      in_use: a process is working in it.
-    """
-
-    directory: Path
-    description: Mapping[str, Any]
-    seconds: float | None
-    results: Mapping[str, Any] | None
-    in_use: bool
+    directory: Path  # `runs/NAME/STAMP`
+    description: Mapping[str, Any]  # content of `config.json`
+    seconds: float | None  # wall time of all its sessions; `None` before the first one ended
+    results: Mapping[str, Any] | None  # content of `results.json`; `None` while it is unfinished
+    in_use: bool  # a process is working in it
 
     @property
     def name(self) -> str:

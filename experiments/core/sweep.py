@@ -34,8 +34,7 @@ from sensors_io.signals import exit_status
 from sensors_io.units import HERE, Launcher, LauncherError, UnitsError, WorkUnit, finish
 from touchr1_jax.bench.scoring import REPORTED
 
-LIST = "sweep.json"
-"""Units of a sweep, in its folder."""
+LIST = "sweep.json"  # units of a sweep, in its folder
 
 FOLDERS = "sweeps"  # folder of the sweeps in the folder of all runs
 
@@ -52,21 +51,13 @@ class SweepError(UserError, ValueError):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SweepUnit:
-    """One run of a sweep.
+    """One run of a sweep."""
 
-    Attributes:
-      digest: hash of scale and configuration, by which the run is found.
-      settings: varied option → value.
-      command: words of the command line after the name of the experiment.
-      home: folder of the runs that it becomes one of.
-      config: in JSON's types.
-    """
-
-    digest: str
-    settings: Mapping[str, str]
-    command: tuple[str, ...]
-    home: Path
-    config: Any
+    digest: str  # hash of scale and configuration, by which the run is found
+    settings: Mapping[str, str]  # varied option → value
+    command: tuple[str, ...]  # words of the command line after the name of the experiment
+    home: Path  # folder of the runs that it becomes one of
+    config: Any  # in JSON's types
 
     @property
     def directory(self) -> Path | None:
@@ -91,16 +82,14 @@ class SweepCommand:
     run is not run again.
     """
 
-    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
-    """An experiment."""
+    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]  # an experiment
     vary: tyro.conf.UseAppendAction[tuple[str, ...]]
     """An option and its values, as in `--vary grpo.lr-scale=50,100,200`; once for each option that varies."""
     into: Path | None = None
     """Folder of the sweep; by default in RUNS_DIR/sweeps, named after the values.  With more values it grows."""
     figures: tuple[str, ...] = ()
     """Words in the names of the figures to show, as `compare` names them; by default the main ones."""
-    runs_dir: Path = Path("runs")
-    """Folder of all runs."""
+    runs_dir: Path = Path("runs")  # folder of all runs
     launcher: Annotated[Launcher, tyro.conf.arg(name="")] = HERE
 
     def run(self, rest: Sequence[str], package: str = "experiments") -> int:
@@ -159,14 +148,9 @@ def plan(
 ) -> tuple[Path, tuple[SweepUnit, ...]]:
     """The folder of a sweep and its units, in the order of the values, the last option fastest.
 
-    Args:
-      vary: options and their values, as `options_of` takes them.
-      rest: words of the command line for all runs.
-      into: the folder; by default named after the units, so that the same sweep goes on in it.
-
-    Raises:
-      SweepError: as `options_of`; an option that a sweep gives itself, or two units of one configuration.
-      SystemExit: code 2 after the correction of an option or a value that the experiment does not know.
+    By default the folder is named after the units, so that the same sweep goes on in it.  `rest` are words for all
+    runs.  `SweepError` as `options_of`, for an option that a sweep gives itself, or two units of one configuration;
+    `SystemExit` with code 2 after the correction of an option or a value that the experiment does not know.
     """
     varied, planned = options_of(vary), dict[str, tuple[dict[str, str], tuple[str, ...], Any]]()
     words = (*rest, *(f"--{option}" for option in varied))

@@ -53,24 +53,17 @@ Prepare = Callable[[Path], None]  # put something into a folder
 
 @dataclasses.dataclass(frozen=True)
 class BadInput:
-    """One kind of bad input.
+    """One kind of bad input."""
 
-    Args:
-      kind, name: where the fault lies, and what it is.
-      command: the command line, a program of `PROGRAMS` first; {folder} stands for the folder that it works in.
-      error, where, way_out: texts that the message must hold.
-      prepare: puts the input into the folder.
-      around: what holds while the command runs, such as a limit.
-    """
-
-    kind: Kind
-    name: str
-    command: str
-    error: str
+    kind: Kind  # where the fault lies
+    name: str  # what it is
+    command: str  # the command line, a program of `PROGRAMS` first; {folder} stands for the folder that it works in
+    error: str  # text that the message must hold, as the next two
     where: str
     way_out: str
-    prepare: Prepare = lambda folder: None
+    prepare: Prepare = lambda folder: None  # puts the input into the folder
     around: Callable[[Path], contextlib.AbstractContextManager[None]] = lambda folder: contextlib.nullcontext()
+    """What holds while the command runs, such as a limit."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -30,8 +30,7 @@ POLL_S = 0.005  # time between two looks at a session's files; a step takes long
 PATIENCE_S = 300.0  # a session that adds nothing to its run for so long hangs
 
 START, BETWEEN, CHECKPOINT = "start-up", "between stages", "writing a checkpoint"
-PRINTED = "printed.txt"
-"""What the sessions of a run printed, in its home."""
+PRINTED = "printed.txt"  # what the sessions of a run printed, in its home
 
 STEPPING = {
     "encoders": "encoders' steps",

@@ -13,10 +13,12 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
-from experiments.core.results import Requirement, Table, at_least, at_most, named_table
+from experiments.core.context import Context
+from experiments.core.results import ReportPart, at_least, at_most, named_table
 from experiments.faults.replayed_camera import NoiseCamera
 from sensors_io.clock import NS_PER_S
 from sensors_io.devices.bridge import BridgeConfig
@@ -66,24 +68,12 @@ _SHIFT = np.stack([_DEPTH, _DEPTH[::-1]], -1) * np.float32(0.3)
 FIELDS = {"depth_mm": _DEPTH, "deformation_mm": _SHIFT, "shear_mm": _SHIFT}  # fields to show with every picture
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ViewedRecording:
-    """One recording, named by the number of its browsers, which show `shown_hz` states a second each (NaN without any).
+def viewed(camera: NoiseCamera, seconds: float, browsers: int | None) -> dict[str, Any]:
+    """Record a camera for some seconds, watched by so many browsers; `None` records without a page.
 
-    `ages_s` [N] are those of the pictures when they were shown, `looks_s` [L] the times between two looks of the
-    recorder at its device; of the samples `written` are in the journal and `lost` are not.
+    States that a browser shows a second, ages of their pictures, times between two looks of the recorder at its device,
+    ms, and the samples that are in the journal and those that are not.
     """
-
-    name: str
-    shown_hz: float
-    ages_s: np.ndarray
-    looks_s: np.ndarray
-    written: int
-    lost: int
-
-
-def viewed(camera: NoiseCamera, seconds: float, browsers: int | None) -> ViewedRecording:
-    """Record a camera for some seconds, watched by so many browsers; `None` records without a page."""
     with contextlib.ExitStack() as stack:
         home = pathlib.Path(stack.enter_context(tempfile.TemporaryDirectory()))
         reader = stack.enter_context(Reader(Replay(dataclasses.replace(camera, arrays=FIELDS))))
@@ -98,15 +88,17 @@ def viewed(camera: NoiseCamera, seconds: float, browsers: int | None) -> ViewedR
         looks, written = _record(reader, journal, seconds)
         counts = reader.counts  # before the browsers end
         ages = [json.loads(browser.communicate()[0])["ages_s"] for browser in watching]
-    total = sum(map(len, ages))
-    return ViewedRecording(
-        name="no page" if browsers is None else f"{browsers} browser" + "s" * (browsers != 1),
-        shown_hz=total / seconds / len(ages) if ages else float("nan"),
-        ages_s=np.array([age for each in ages for age in each]),
-        looks_s=looks,
-        written=written,
-        lost=counts.lost,
-    )
+    shown = np.array([age for each in ages for age in each])
+    return {
+        "watched by": "no page" if browsers is None else f"{browsers} browser" + "s" * (browsers != 1),
+        "shown": len(shown) / seconds / len(ages) if ages else None,
+        "age, median": _quantile_ms(shown, 0.5),
+        "age, p95": _quantile_ms(shown, 0.95),
+        "look, p99": _quantile_ms(looks, 0.99),
+        "look, longest": _quantile_ms(looks, 1.0),
+        "recorded": written,
+        "lost": counts.lost,
+    }
 
 
 def _record(reader: Reader, journal: JournalWriter, seconds: float) -> tuple[np.ndarray, int]:
@@ -124,14 +116,6 @@ def _record(reader: Reader, journal: JournalWriter, seconds: float) -> tuple[np.
     return np.diff(looks), written
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class BridgeTransfer:
-    """Pictures through a bridge: how many in a second, and the age of each when it was read, [N]."""
-
-    rate_hz: float
-    ages_s: np.ndarray
-
-
 def frames(count: str) -> Iterator[tuple[int, int, dict[str, np.ndarray]]]:
     """An adapter for `bridge_server` in place of a vendor's SDK: pictures of noise, stamped when they are made."""
     noise = np.random.default_rng(0).integers(0, 256, BRIDGE_SHAPE, dtype=np.uint8)
@@ -139,8 +123,8 @@ def frames(count: str) -> Iterator[tuple[int, int, dict[str, np.ndarray]]]:
         yield time.monotonic_ns(), n, {"frame_bgr": noise}
 
 
-def bridged(count: int) -> BridgeTransfer:
-    """Read so many pictures from a bridge as fast as it gives them; the first is left out."""
+def bridged(count: int) -> dict[str, Any]:
+    """Rate and age of so many pictures, read from a bridge as fast as it gives them; the first is left out."""
     config = BridgeConfig(python=sys.executable, adapter=f"{__name__}:{frames.__name__}", serial=str(count))
     stamps: list[tuple[int, int]] = []
     with config.open() as device, contextlib.suppress(DeviceLostError):  # it ends after so many
@@ -149,62 +133,50 @@ def bridged(count: int) -> BridgeTransfer:
             sample = device.read(60.0)
             stamps.append((sample.host_time_ns, time.monotonic_ns()))
     made, read = np.array(stamps, np.int64).T
-    return BridgeTransfer(
-        rate_hz=(len(read) - 1) * NS_PER_S / float(read[-1] - read[0]), ages_s=(read - made) / NS_PER_S
-    )
-
-
-def requirements(views: Sequence[ViewedRecording], transfer: BridgeTransfer) -> tuple[Requirement, ...]:
-    """Bounds on losses, on the age of pictures and on the rate of the bridge."""
-    oldest = max(float(np.quantile(w.ages_s, 0.95)) for w in views if len(w.ages_s))
-    return (
-        at_most("samples lost while watched", sum(w.lost for w in views), 0),
-        at_most("age of what a browser shows, p95, worst", 1e3 * oldest, 150, "ms"),
-        at_least("pictures of 640 × 480 through a bridge", transfer.rate_hz, FASTEST_HZ, "Hz"),
-    )
-
-
-def viewing_table(views: Sequence[ViewedRecording]) -> Table:
-    """Ages of the pictures in browsers, and times between two looks of the recorder at its device."""
-    times = dict.fromkeys(("age, median", "age, p95", "look, p99", "look, longest"), "ms")
-    return named_table(
-        "A recording that is watched",
-        [
-            {
-                "watched by": view.name, "shown": None if np.isnan(view.shown_hz) else view.shown_hz,
-                "age, median": _quantile_ms(view.ages_s, 0.5), "age, p95": _quantile_ms(view.ages_s, 0.95),
-                "look, p99": _quantile_ms(view.looks_s, 0.99), "look, longest": _quantile_ms(view.looks_s, 1.0),
-                "recorded": view.written, "lost": view.lost,
-            }
-            for view in views
-        ],
-        formats=dict.fromkeys(times, ".1f") | {"shown": ".1f", "age, median": ".0f", "age, p95": ".0f"},
-        units={"shown": "Hz"} | times,
-        meanings={
-            "shown": "states that one browser shows",
-            "age, median": "of all panels when the last is there",
-            "look, p99": "between two looks of the recorder",
-        },
-        note="Camera, recorder, server and browsers share the cores of the run; four panels a page.",
-    )  # fmt: skip
-
-
-def bridge_table(transfer: BridgeTransfer) -> Table:
-    """Rate of a bridge and age of its pictures."""
-    row = {
+    rate_hz, ages = (len(read) - 1) * NS_PER_S / float(read[-1] - read[0]), (read - made) / NS_PER_S
+    return {
         "picture": " × ".join(map(str, BRIDGE_SHAPE)),
-        "rate": transfer.rate_hz,
-        "carried": transfer.rate_hz * float(np.prod(BRIDGE_SHAPE)) / 1e6,
-        "age when read, median": _quantile_ms(transfer.ages_s, 0.5),
-        "age when read, p95": _quantile_ms(transfer.ages_s, 0.95),
+        "rate": rate_hz,
+        "carried": rate_hz * float(np.prod(BRIDGE_SHAPE)) / 1e6,
+        "age when read, median": _quantile_ms(ages, 0.5),
+        "age when read, p95": _quantile_ms(ages, 0.95),
     }
-    return named_table(
-        "Pictures through a bridge",
-        [row],
-        formats=dict.fromkeys(list(row)[1:3], ".0f") | dict.fromkeys(list(row)[3:], ".1f"),
-        units=dict(zip(list(row)[1:], ("Hz", "MB/s", "ms", "ms"), strict=True)),
-        note="The adapter gives pictures as fast as they are taken, so the age is that of a full pipe.",
-    )
+
+
+def viewing_section(
+    camera: NoiseCamera, seconds: float, browsers: Sequence[int], pictures: int, context: Context
+) -> list[ReportPart]:
+    """Recordings of some seconds that so many browsers watch in turn; so many pictures through a bridge."""
+    watched = context.each("watched recordings", (None, *browsers))
+    views = [viewed(camera, seconds, number) for number in watched]
+    transfer, most = bridged(pictures), views[-1]
+    times = dict.fromkeys(("age, median", "age, p95", "look, p99", "look, longest"), "ms")
+    return [
+        f"Watched by {most['watched by']}, a recording loses {most['lost']} of {most['recorded']} samples; a bridge "
+        f"carries {transfer['rate']:.0f} pictures a second.",
+        at_most("samples lost while watched", sum(view["lost"] for view in views), 0),
+        at_most("age of what a browser shows, p95, worst", max(view["age, p95"] or 0.0 for view in views), 150, "ms"),
+        at_least("pictures of 640 × 480 through a bridge", transfer["rate"], FASTEST_HZ, "Hz"),
+        named_table(
+            "A recording that is watched",
+            views,
+            formats=dict.fromkeys(times, ".1f") | {"shown": ".1f", "age, median": ".0f", "age, p95": ".0f"},
+            units={"shown": "Hz"} | times,
+            meanings={
+                "shown": "states that one browser shows",
+                "age, median": "of all panels when the last is there",
+                "look, p99": "between two looks of the recorder",
+            },
+            note="Camera, recorder, server and browsers share the cores of the run; four panels a page.",
+        ),
+        named_table(
+            "Pictures through a bridge",
+            [transfer],
+            formats=dict.fromkeys(list(transfer)[1:3], ".0f") | dict.fromkeys(list(transfer)[3:], ".1f"),
+            units=dict(zip(list(transfer)[1:], ("Hz", "MB/s", "ms", "ms"), strict=True)),
+            note="The adapter gives pictures as fast as they are taken, so the age is that of a full pipe.",
+        ),
+    ]
 
 
 def _quantile_ms(seconds: np.ndarray, share: float) -> float | None:

@@ -26,8 +26,7 @@ class NoiseCamera:
 
     rate_hz: float
     size_px: tuple[int, int]
-    arrays: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
-    """Given with every picture."""
+    arrays: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)  # given with every picture
 
     @property
     def identity(self) -> Identity:
@@ -44,20 +43,13 @@ class NoiseCamera:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ReplayOutcome:
-    """One replay: faults of the device, counts of the reader, lateness of the stamps, memory.
+    """One replay: faults of the device, counts of the reader, lateness of the stamps, memory."""
 
-    Args:
-      truth, counts: of the device, of the reader.
-      late_s: of the samples' host stamps after the true times, [3]: median, 99th percentile, largest.
-      memory_mb: of the process at every tenth of the time, [11].
-      traced_growth_kb: of Python's own memory from the first tenth to the end; NaN where it was not traced.
-    """
-
-    truth: Truth
-    counts: Counts
-    late_s: np.ndarray
-    memory_mb: np.ndarray
-    traced_growth_kb: float
+    truth: Truth  # of the device
+    counts: Counts  # of the reader
+    late_s: np.ndarray  # of the samples' host stamps after the true times, [3]: median, 99th percentile, largest
+    gained_mb: float  # memory of the process from the first tenth of the time to the end
+    gained_kb: float  # the same of Python, where it was traced
 
     @property
     def wrong(self) -> dict[str, int]:
@@ -93,26 +85,31 @@ def replay_camera(
     replay = Replay(source, seconds=seconds, faults=faults, clock=clock)
     intake = Intake(capacity=capacity, clock=clock)
     pump = Pump(replay, intake, ReaderConfig(capacity=capacity), clock, threading.Event())
-    late, memory = _Lateness(source.rate_hz), _MemoryLog(seconds, traced)
+    late, tenths, visits, first = _Lateness(source.rate_hz), 0, 0, (0.0, 0.0)
+    if traced:
+        tracemalloc.start()
     pump.open()
-    visits = 0
     while pump.step():
         visits += 1
         if visits % every == 0:
             for _ in range(min(intake.counts.waiting, max(1, capacity // 2))):
                 late.add(intake.next(0.0).host_time_ns)
-        if memory.look(clock.now_ns() / NS_PER_S):
-            report(round(clock.now_ns() / NS_PER_S), round(seconds))
+        if (now_s := clock.now_ns() / NS_PER_S) >= tenths * seconds / 10:
+            first = _memory() if tenths == 1 else first
+            tenths += 1
+            report(round(now_s), round(seconds))
     while intake.counts.waiting:
         intake.next(0.0)
-    memory.look(seconds)
+    last = _memory()
+    if traced:
+        tracemalloc.stop()
     report(round(seconds), round(seconds))
     return ReplayOutcome(
         truth=replay.truth,
         counts=intake.counts,
         late_s=late.quantiles_s(),
-        memory_mb=np.array(memory.resident_mb),
-        traced_growth_kb=memory.traced_growth_kb(),
+        gained_mb=last[0] - first[0],
+        gained_kb=last[1] - first[1],
     )
 
 
@@ -134,29 +131,7 @@ class _Lateness:
         return self._BINS[np.searchsorted(share, (0.5, 0.99, 1.0 - 1e-12))] * self._period_ns / NS_PER_S
 
 
-class _MemoryLog:
-    """Memory of the process at every tenth of the time, and of Python's objects from the first tenth on."""
-
-    def __init__(self, seconds: float, traced: bool):
-        self._every_s, self._next_s = seconds / 10, 0.0
-        self._traced, self._first_kb = traced, np.nan
-        self.resident_mb: list[float] = []
-        if traced:
-            tracemalloc.start()
-
-    def look(self, now_s: float) -> bool:
-        """Log the memory if it is time; return True if it was."""
-        if now_s < self._next_s:
-            return False
-        self._next_s += self._every_s
-        self.resident_mb.append(int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1]) * _PAGE_MB)
-        if self._traced and len(self.resident_mb) == 2:
-            self._first_kb = tracemalloc.get_traced_memory()[0] / 1e3
-        return True
-
-    def traced_growth_kb(self) -> float:
-        if not self._traced:
-            return float("nan")
-        last_kb = tracemalloc.get_traced_memory()[0] / 1e3
-        tracemalloc.stop()
-        return last_kb - self._first_kb
+def _memory() -> tuple[float, float]:
+    """Resident memory of the process, MB, and Python's own as far as it is traced, kB."""
+    pages = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1])
+    return pages * _PAGE_MB, tracemalloc.get_traced_memory()[0] / 1e3

@@ -2,13 +2,11 @@
 
     python -m experiments stability_devices [--data-dir DIR] [--scale smoke]
 
-The package's reader reads one hour of a 120 Hz camera in compressed time, with 2 % drops, duplicates, jitter, a clock
-that gains 50 ppm and three disconnects.  It reads with the device's counter, without it (it then estimates losses from
-timestamps and recognises duplicates by their pictures), and with a consumer too slow for its ring buffer.  Its counts
-are compared with the injected faults; memory is logged at every tenth of the hour, once with Python's own memory
-traced.  In the vendor's Tac3D recordings in DIR/tac3d, the real gaps must be counted exactly.  The time to decode a
-message is measured, cached and by YAML if ruamel.yaml is installed.  Finally, a camera at its true rate is recorded
-while browsers display it, and a bridge transfers the pictures of a vendor's camera.
+The package's reader reads one hour of a 120 Hz camera in compressed time, with drops, duplicates, jitter, a clock that
+gains and three disconnects: with the device's counter, without it (losses are then estimated from timestamps), and with
+a consumer too slow for its ring buffer.  In the vendor's Tac3D recordings in DIR/tac3d the real gaps must be counted
+exactly, and the time to decode a message is measured, also by YAML if ruamel.yaml is installed.  Finally, a camera at
+its true rate is recorded while browsers display it, and a bridge transfers a vendor's pictures.
 
 Two minutes on one core (`smoke` twenty seconds).  Expected: with a counter every sample is accounted for; without one
 the estimate is off by one in a thousand of the losses until stamps jitter by a quarter of the period; memory stays
@@ -19,13 +17,13 @@ recording nothing but processor time.
 import dataclasses
 import pathlib
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
-from experiments.core.charts import Panel, Rule, Series, draw
+from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context
-from experiments.core.results import Picture, Requirement, Results, Table, at_most, named_table
+from experiments.core.results import Picture, ReportPart, Results, assemble, at_most, named_table
 from experiments.core.runner import Experiment
 from experiments.core.text import plain
 from experiments.faults import live_viewing as viewing
@@ -74,40 +72,21 @@ def run(config: DeviceStabilityConfig, context: Context) -> Results:
     faults = injected(config.traced_seconds)
     with context.progress_callback("device time with Python's memory traced, s") as report:
         traced = replay_camera(camera, config.traced_seconds, faults, capacity=256, traced=True, report=report)
-    sweep = over_jitter(camera, config.sweep_seconds, context)
-    paths = tac3d.recordings(config.data_dir)
-    checks = [tac3d.check(path) for path in context.each("recordings", paths)]
-    rounds = context.rounds("timing decoders", config.rounds)
-    decode = tac3d.decode_ms(tac3d.message(paths[0] if paths else None), rounds)
-    browsers = context.each("watched recordings", (None, *config.browsers))
-    views = [viewing.viewed(camera, config.watch_seconds, number) for number in browsers]
-    transfer = viewing.bridged(config.bridge_frames)
-    return Results(
-        verdict=verdict(outcomes, checks, decode, views, transfer),
-        requirements=(
-            *replay_requirements(outcomes, traced),
-            *tac3d.requirements(checks, decode),
-            *viewing.requirements(views, transfer),
-        ),
-        tables=(
-            account_table(outcomes),
-            *([tac3d.recording_table(checks)] if checks else []),
-            tac3d.decoder_table(decode),
-            viewing.viewing_table(views),
-            viewing.bridge_table(transfer),
-        ),
-        pictures=(jitter_picture(sweep), memory_picture(outcomes, config.seconds)),
-        settings={
-            "samples": round(config.seconds * RATE_HZ),
-            "pictures": f"{config.size_px[0]} × {config.size_px[1]}",
-            "faults": f"{100 * FAULTS.drop_share:g} % drops, {100 * FAULTS.duplicate_share:g} % duplicates, "
-            f"jitter {1e3 * FAULTS.jitter_s:g} ms, clock {1e6 * FAULTS.skew:g} ppm fast, "
-            f"away {plain(list(AWAY_S.values()))} s",
-            "vendor's recordings": ", ".join(c.name for c in checks) or "no --data-dir",
-            "vendor's parser installed": tac3d.YAML,
-        },
-        data={name: o.wrong for name, o in outcomes.items()},
-    )
+    parts = [
+        *replay_section(outcomes, traced, over_jitter(camera, config.sweep_seconds, context)),
+        *tac3d.recording_section(config.data_dir, config.rounds, context),
+        *viewing.viewing_section(camera, config.watch_seconds, config.browsers, config.bridge_frames, context),
+    ]
+    settings = {
+        "samples": round(config.seconds * RATE_HZ),
+        "pictures": f"{config.size_px[0]} × {config.size_px[1]}",
+        "faults": f"{100 * FAULTS.drop_share:g} % drops, {100 * FAULTS.duplicate_share:g} % duplicates, "
+        f"jitter {1e3 * FAULTS.jitter_s:g} ms, clock {1e6 * FAULTS.skew:g} ppm fast, "
+        f"away {plain(list(AWAY_S.values()))} s",
+        "vendor's recordings": ", ".join(path.stem for path in tac3d.recordings(config.data_dir)) or "no --data-dir",
+        "vendor's parser installed": tac3d.YAML,
+    }
+    return assemble(parts, settings, {name: o.wrong for name, o in outcomes.items()})
 
 
 def replay_whole(name: str, camera: NoiseCamera, seconds: float, context: Context) -> ReplayOutcome:
@@ -138,40 +117,14 @@ def over_jitter(camera: NoiseCamera, seconds: float, context: Context) -> dict[s
     return {name: np.array(values) for name, values in found.items()}
 
 
-def verdict(
-    outcomes: Mapping[str, ReplayOutcome],
-    checks: Sequence[tac3d.RecordingCheck],
-    decode: Mapping[str, np.ndarray],
-    views: Sequence[viewing.ViewedRecording],
-    transfer: viewing.BridgeTransfer,
-) -> tuple[str, ...]:
-    """Counts of lost samples, the decoder's time, and the effect of browsers."""
+def replay_section(
+    outcomes: Mapping[str, ReplayOutcome], traced: ReplayOutcome, sweep: Mapping[str, np.ndarray]
+) -> list[ReportPart]:
+    """Lost samples that were counted and injected, memory, and where counting without a counter breaks."""
     counter, stamps, slow = (outcomes[name] for name in (BY_COUNTER, BY_STAMPS, SLOW))
-    most, missing, losses = views[-1], stamps.wrong["missing"], stamps.truth.dropped + stamps.truth.away
-    return (
-        f"Of {counter.truth.produced} samples {sum(map(abs, counter.wrong.values()))} are wrongly counted with a "
-        f"counter; without one the {losses} losses are estimated {missing:+d} off; a consumer too slow for its ring "
-        f"loses {slow.counts.overwritten} samples, all of them counted.",
-        *(f"{c.name}: {c.counts.missing} of {c.frames + c.missing} indices are missing." for c in checks),
-        f"A Tac3D message decodes in {np.median(decode[tac3d.CACHED]):.4f} ms; watched by {most.name}, a recording "
-        f"loses {most.lost} of {most.written} samples; a bridge carries {transfer.rate_hz:.0f} pictures a second.",
-    )
-
-
-def replay_requirements(outcomes: Mapping[str, ReplayOutcome], traced: ReplayOutcome) -> tuple[Requirement, ...]:
-    """Bounds on the errors of the counts and on memory."""
-    exact = sum(abs(n) for name in (BY_COUNTER, SLOW) for n in outcomes[name].wrong.values())
-    memory = outcomes[BY_COUNTER].memory_mb
-    return (
-        at_most("losses, duplicates, disconnects not counted", exact, 0),
-        at_most("samples unaccounted for", sum(o.counts.unaccounted for o in outcomes.values()), 0),
-        at_most("memory gained from the first tenth to the last", memory[-1] - memory[1], MOST_GAINED_MB, "MB"),
-        at_most("Python's memory gained, traced", traced.traced_growth_kb, 100, "kB"),
-    )
-
-
-def account_table(outcomes: Mapping[str, ReplayOutcome]) -> Table:
-    """The reader's counts and the truth."""
+    missing, losses = stamps.wrong["missing"], stamps.truth.dropped + stamps.truth.away
+    exact = sum(abs(n) for one in (counter, slow) for n in one.wrong.values())
+    late = ("late, median", "late, p99")
     rows = [
         {
             "replay": name, "produced": o.truth.produced, "dropped": o.truth.dropped, "away": o.truth.away,
@@ -183,15 +136,25 @@ def account_table(outcomes: Mapping[str, ReplayOutcome]) -> Table:
         }
         for name, o in outcomes.items()
     ]  # fmt: skip
-    late = ("late, median", "late, p99")
-    return named_table(
-        "Counted and injected losses",
-        rows,
-        formats=dict.fromkeys(late, ".2f"),
-        units=dict.fromkeys(late, "ms"),
-        note="Losses before the first sample and after the last are left out, for they cannot be noticed. Late: time "
-        "from when a sample was taken to its stamp, which is that of its arrival where the device gives no clock.",
-    )
+    return [
+        f"Of {counter.truth.produced} samples {sum(map(abs, counter.wrong.values()))} are wrongly counted with a "
+        f"counter; without one the {losses} losses are estimated {missing:+d} off; a consumer too slow for its ring "
+        f"loses {slow.counts.overwritten} samples, all of them counted.",
+        at_most("losses, duplicates, disconnects not counted", exact, 0),
+        at_most("samples unaccounted for", sum(o.counts.unaccounted for o in outcomes.values()), 0),
+        at_most("memory gained from the first tenth to the last", counter.gained_mb, MOST_GAINED_MB, "MB"),
+        at_most("Python's memory gained, traced", traced.gained_kb, 100, "kB"),
+        named_table(
+            "Counted and injected losses",
+            rows,
+            formats=dict.fromkeys(late, ".2f"),
+            units=dict.fromkeys(late, "ms"),
+            note="Losses before the first sample and after the last are left out, for they cannot be noticed. Late: "
+            "time from when a sample was taken to its stamp, which is that of its arrival where the device gives no "
+            "clock.",
+        ),
+        jitter_picture(sweep),
+    ]
 
 
 def jitter_picture(sweep: Mapping[str, np.ndarray]) -> Picture:
@@ -209,28 +172,6 @@ def jitter_picture(sweep: Mapping[str, np.ndarray]) -> Picture:
         title="Where counting without a counter breaks",
         caption="With a counter losses are counted exactly whatever the delays; stamps alone give the number while "
         "delays stay well below half a period. The axis is linear up to 0.1 %.",
-        content=draw([panel], size=(6.6, 3.4)),
-    )
-
-
-def memory_picture(outcomes: Mapping[str, ReplayOutcome], seconds: float) -> Picture:
-    """Resident memory over the time of each replay."""
-    panel = Panel(
-        [
-            Series(name, x=np.linspace(0, seconds / 60, len(o.memory_mb)), y=o.memory_mb - o.memory_mb[0])
-            for name, o in outcomes.items()
-        ],
-        x_label="device time, minutes",
-        y_label="resident memory gained, MB",
-        y_limits=(-1, 1.2 * MOST_GAINED_MB),
-        rules=[Rule(y=MOST_GAINED_MB)],
-    )
-    start = ", ".join(f"{o.memory_mb[0]:.0f}" for o in outcomes.values())
-    return Picture(
-        name="memory",
-        title="Memory stays flat",
-        caption="Memory of the process since each replay began, one after the other in the same process (at the start "
-        f"{start} MB); dotted, the bound.",
         content=draw([panel], size=(6.6, 3.4)),
     )
 

@@ -2,14 +2,11 @@
 
     make experiment EXP=stability_faults [ARGS="--scale smoke"]
 
-Four parts.  Kills: `kill -9` ends training at random moments, a quarter of them during start-up and the others spread
-over the whole run, and the run is continued until it is finished; logs, answers and the final state of every stage are
-compared bit by bit with those of an undisturbed run.  The networks are so small that the loop takes most of the time of
-a step.  The GRPO of a study, which starts in seconds, is killed 200 times; a complete study of supervised fine-tuning,
-GRPO and a baseline without touch is killed a few times.  Damage: every file of an unfinished run is damaged in four
-ways, and single bits are flipped in all files of an unfinished and a finished study and their caches; the files are
-read and the run is continued.  Bad input: about forty kinds through the public command lines.  Waiting: the share of a
-step that waits for data, at the sizes of the studies, on a CPU.
+Kills: `kill -9` ends training at random moments, a quarter of them during start-up, and the run is continued until it
+is finished; it is compared bit by bit with an undisturbed one.  The GRPO of a study is killed 200 times, a complete
+study a few times; their networks are so small that the loop takes most of the time of a step.  Damage: every file of an
+unfinished run, in four ways, and single bits in all files of a study and its cache.  Bad input: about forty kinds
+through the public command lines.  Waiting: the share of a step that waits for data, on a CPU.
 
 Cost: 111 minutes in the recorded run on one core of a busy machine, most of it the 200 kills; `--scale smoke` about
 a minute and a half.
@@ -20,6 +17,7 @@ waits below 2 % of a step.
 
 import dataclasses
 import tempfile
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,7 +27,7 @@ import numpy as np
 from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context
 from experiments.core.loops import STEPPING, WAITING
-from experiments.core.results import Picture, Requirement, Results, Table, at_least, at_most, named_table
+from experiments.core.results import Picture, Results, Table, at_least, at_most, named_table
 from experiments.core.runner import Experiment
 from experiments.encoder.pretrain import pretrain
 from experiments.faults.bad_inputs import cases, provoke
@@ -89,8 +87,7 @@ class FaultsConfig:
     damaged_files: int | None = None
     flips: int = 1000
     """Bits flipped in the files of an unfinished and a finished study and their caches, of which each is read."""
-    resumed_flips: int = 40
-    """Of those that are found, the number of those with which the study goes on, each alone."""
+    resumed_flips: int = 40  # of those that are found, the number of those with which the study goes on, each alone
     bad_inputs: int | None = None
     waiting: WaitingConfig = WaitingConfig()
 
@@ -117,24 +114,12 @@ def run(config: FaultsConfig, context: Context) -> Results:
         "study": kill_training("study", whole, config.study, context),
     }
     with tempfile.TemporaryDirectory(prefix="touchr1-faults-") as scratch:
-        damage = damage_files(config.damaged_files, context, Path(scratch))
-        flips, ends = flip_files(config, whole, context, Path(scratch))
-        damage += ends
-        inputs = try_inputs(config.bad_inputs, context, Path(scratch))
-    waited = waits(config.waiting, context)
-    return Results(
-        verdict=verdict(killed, damage, flips, inputs, waited),
-        requirements=requirements(killed, damage, flips, inputs, waited),
-        tables=(
-            kill_table(killed),
-            damage_table(damage),
-            flip_table(flips),
-            input_table(inputs),
-            waiting_table(waited),
-        ),
-        pictures=(kill_picture({name: each.kills for name, each in killed.items()}),),
-        settings={"kills": sum(len(k.kills) for k in killed.values()), "bad inputs": len(inputs)},
-    )
+        home = Path(scratch)
+        damaged = context.once("damage", lambda: damage_files(config.damaged_files, context, home))
+        flips, ends = flip_files(config, whole, context, home)
+        inputs = context.once("inputs", lambda: try_inputs(config.bad_inputs, context, home))
+    damage = [*(Damage(**one) for one in damaged), *ends]
+    return report(killed, damage, flips, inputs, waits(config.waiting, context))
 
 
 def kill_training(name: str, training: KillableTraining, config: KillConfig, context: Context) -> KilledRuns:
@@ -204,29 +189,25 @@ def flip_files(
 
 def damage_files(most: int | None, context: Context, scratch: Path) -> list[Damage]:
     """Every damaged file and the end of its run."""
-    if not context.done("damage"):
-        unfinished, damaged = scratch / "unfinished", scratch / "damaged"
-        unfinished.mkdir()
-        damaged.mkdir()
-        unfinished_run(unfinished)
-        context.save_stage("damage", list(damage_each(unfinished, damaged, context, most)))
-    return [Damage(**one) for one in context.load_stage("damage")]
+    unfinished, damaged = scratch / "unfinished", scratch / "damaged"
+    unfinished.mkdir()
+    damaged.mkdir()
+    unfinished_run(unfinished)
+    return list(damage_each(unfinished, damaged, context, most))
 
 
 def try_inputs(most: int | None, context: Context, scratch: Path) -> list[InputRow]:
     """Every bad input and its answer."""
-    if not context.done("inputs"):
-        unfinished_run(scratch / "inputs")
-        rows = []
-        tried = enumerate(cases(scratch / "inputs")[:most])
-        for i, case in context.each("trying bad inputs", tried, still=True):  # the commands' output is captured
-            folder = scratch / f"case-{i}"
-            folder.mkdir()
-            found = provoke(case, folder)
-            answer = {"exit code": found.code, "answer": found.line.replace(str(folder), "…")}
-            rows.append({"input": case.name, "kind": case.kind, **answer, "faults": ", ".join(found.faults)})
-        context.save_stage("inputs", rows)
-    return context.load_stage("inputs")
+    unfinished_run(scratch / "inputs")
+    rows = list[InputRow]()
+    tried = enumerate(cases(scratch / "inputs")[:most])
+    for i, case in context.each("trying bad inputs", tried, still=True):  # the commands' output is captured
+        folder = scratch / f"case-{i}"
+        folder.mkdir()
+        found = provoke(case, folder)
+        answer = {"exit code": found.code, "answer": found.line.replace(str(folder), "…")}
+        rows.append({"input": case.name, "kind": case.kind, **answer, "faults": ", ".join(found.faults)})
+    return rows
 
 
 def waits(config: WaitingConfig, context: Context) -> Waits:
@@ -248,51 +229,54 @@ def waits(config: WaitingConfig, context: Context) -> Waits:
     return {stage: (times[f"{STEPPING}/{stage}"], times[f"{WAITING}/{stage}"]) for stage in stages}
 
 
-def requirements(
+def report(
     killed: Mapping[str, KilledRuns],
     damage: Sequence[Damage],
     flips: Sequence[Flip],
     inputs: Sequence[InputRow],
     waited: Waits,
-) -> tuple[Requirement, ...]:
-    """Kills survived, wrong ends, inputs that are answered, waits."""
+) -> Results:
+    """Kills survived, ends with damaged files, readings of flipped bits, inputs that are answered, waits."""
     at_start = max(sum(k.phase == START for k in each.kills) / len(each.kills) for each in killed.values())
-    answered = sum(not row["faults"] for row in inputs)
-    return (
-        at_least("kills of the GRPO run", len(killed[GRPO].kills), KILLS),
-        at_most("runs that they were spread over", killed[GRPO].runs, 1),
-        at_most("files that differ after them", sum(len(k.differs) for k in killed.values()), 0),
-        at_most("share of kills at start-up", at_start, 0.5, note="of the training with the larger share"),
-        at_most("damaged files with a wrong end", sum(one.outcome == WRONG for one in damage), 0),
-        at_most("flipped bits that read as something else", sum(one.reading == WRONG_READING for one in flips), 0),
-        at_most("flipped bits that end in a raw error", sum(one.reading == RAW for one in flips), 0),
-        at_least("kinds of bad input answered", answered, 25),
-        at_most("kinds of bad input not answered", len(inputs) - answered, 0),
-        *(
-            at_most(f"{stage}: share of a step that waits for data", wait_s / steps_s, MOST_WAITING)
-            for stage, (steps_s, wait_s) in waited.items()
-        ),
-    )
-
-
-def verdict(
-    killed: Mapping[str, KilledRuns],
-    damage: Sequence[Damage],
-    flips: Sequence[Flip],
-    inputs: Sequence[InputRow],
-    waited: Waits,
-) -> tuple[str, ...]:
-    """Kills and differences of each training, ends with damaged files, answered inputs, the longest wait."""
+    differs, answered = sum(len(k.differs) for k in killed.values()), sum(not row["faults"] for row in inputs)
+    ends, readings = Counter(one.outcome for one in damage), Counter(one.reading for one in flips)
     kills = "; ".join(f"the {name}, {len(k.kills)} times, {len(k.differs)} differences" for name, k in killed.items())
-    ends = ", ".join(f"{sum(one.outcome == outcome for one in damage)} {outcome}" for outcome in OUTCOMES)
-    readings = ", ".join(f"{sum(one.reading == name for one in flips)} {name}" for name in READINGS)
-    worst = max(wait_s / steps_s for steps_s, wait_s in waited.values())
-    return (
-        f"Killed by SIGKILL and resumed: {kills}.",
-        f"Of {len(damage)} damaged files: {ends}.",
-        f"Of {len(flips)} flipped bits: {readings}.",
-        f"For {sum(not row['faults'] for row in inputs)} of {len(inputs)} kinds of bad input the error message names "
-        f"the place and a fix.  A training step waits for data in at most {worst:.2%} of its time.",
+    said = lambda counts, names: ", ".join(f"{counts[name]} {name}" for name in names)
+    return Results(
+        verdict=(
+            f"Killed by SIGKILL and resumed: {kills}.",
+            f"Of {len(damage)} damaged files: {said(ends, OUTCOMES)}.  Of {len(flips)} flipped bits: "
+            f"{said(readings, READINGS)}.",
+            f"For {answered} of {len(inputs)} kinds of bad input the error message names the place and a fix.",
+        ),
+        requirements=(
+            at_least("kills of the GRPO run", len(killed[GRPO].kills), KILLS),
+            at_most("runs that they were spread over", killed[GRPO].runs, 1),
+            at_most("files that differ after them", differs, 0),
+            at_most("share of kills at start-up", at_start, 0.5, note="of the training with the larger share"),
+            at_most("damaged files with a wrong end", ends[WRONG], 0),
+            at_most("flipped bits that read as something else", readings[WRONG_READING], 0),
+            at_most("flipped bits that end in a raw error", readings[RAW], 0),
+            at_least("kinds of bad input answered", answered, 25),
+            at_most("kinds of bad input not answered", len(inputs) - answered, 0),
+            *(
+                at_most(f"{stage}: share of a step that waits for data", wait_s / steps_s, MOST_WAITING)
+                for stage, (steps_s, wait_s) in waited.items()
+            ),
+        ),
+        tables=(
+            kill_table(killed),
+            damage_table(damage),
+            flip_table(flips),
+            named_table(
+                "Bad inputs",
+                [{**row, "answer": row["answer"][:CELL], "faults": row["faults"] or "none"} for row in inputs],
+                meanings={"faults": "what the answer lacks, and what was lost or left half-written"},
+            ),
+            waiting_table(waited),
+        ),
+        pictures=(kill_picture(killed),),
+        settings={"kills": sum(len(k.kills) for k in killed.values()), "bad inputs": len(inputs)},
     )
 
 
@@ -312,37 +296,29 @@ def kill_table(killed: Mapping[str, KilledRuns]) -> Table:
 
 
 def damage_table(damage: Sequence[Damage]) -> Table:
-    """Ends by kind of file and damage."""
-    by_kind: dict[str, list[Damage]] = {}
-    for one in damage:
-        by_kind.setdefault(f"{one.file}, {one.damage}", []).append(one)
-    count = lambda same: {outcome: sum(one.outcome == outcome for one in same) for outcome in OUTCOMES}
+    """Ends by kind of file and damage, with the first message of each kind."""
+    ends = Counter((f"{one.file}, {one.damage}", one.outcome) for one in damage)
+    message = {f"{one.file}, {one.damage}": one.message[:CELL] for one in reversed(damage)}
     return named_table(
         "Damaged files of a resumed run",
-        [{"damage": kind, **count(same), "message": same[0].message[:CELL]} for kind, same in by_kind.items()],
+        [
+            {"damage": kind, **{outcome: ends[kind, outcome] for outcome in OUTCOMES}, "message": message[kind]}
+            for kind in dict.fromkeys(kind for kind, _ in ends)
+        ],
         note="All files of the newer of two checkpoints, and those of the run that its next session reads.",
     )
 
 
 def flip_table(flips: Sequence[Flip]) -> Table:
     """Readings by kind of file."""
-    by_kind: dict[str, list[Flip]] = {}
-    for one in sorted(flips, key=lambda flip: flip.file):
-        by_kind.setdefault(one.file, []).append(one)
-    count = lambda same: {name: sum(one.reading == name for one in same) for name in READINGS}
+    readings = Counter((one.file, one.reading) for one in flips)
     return named_table(
         "Flipped bits of an unfinished and a finished study and their caches",
-        [{"file": name, **count(same)} for name, same in by_kind.items()],
+        [
+            {"file": file, **{reading: readings[file, reading] for reading in READINGS}}
+            for file in sorted({one.file for one in flips})
+        ],
         note="One random bit of a random file of a random kind; the file is read as a session reads it.",
-    )
-
-
-def input_table(inputs: Sequence[InputRow]) -> Table:
-    """Every bad input and its answer."""
-    return named_table(
-        "Bad inputs",
-        [{**row, "answer": row["answer"][:CELL], "faults": row["faults"] or "none"} for row in inputs],
-        meanings={"faults": "what the answer lacks, and what was lost or left half-written"},
     )
 
 
@@ -360,26 +336,22 @@ def waiting_table(waited: Waits) -> Table:
     )
 
 
-def kill_picture(kills: Mapping[str, Sequence[Kill]]) -> Picture:
-    """Kills by phase, and by the share of the run's steps that were done, over all trainings."""
-    phases = [phase for phase in PHASES if any(kill.phase == phase for each in kills.values() for kill in each)]
+def kill_picture(killed: Mapping[str, KilledRuns]) -> Picture:
+    """Kills by the share of the run's steps that were done."""
     edges = np.linspace(0, 100, 21)
-    by_phase, by_share = [], []
-    for name, each in kills.items():
-        by_phase.append(Series(name, x=[sum(k.phase == phase for k in each) for phase in phases], bar=True))
-        counts = np.histogram([100 * kill.done for kill in each], edges)[0]
-        by_share.append(Series(name, x=counts[::-1], bar=True))
-    shares = [f"{low:.0f}–{low + 5:.0f}" for low in edges[-2::-1]]
-    panels = [
-        Panel(by_phase, rows=phases, stacked=True, written=".0f", x_label="kills"),
-        Panel(by_share, rows=shares, stacked=True, x_label="kills", title="steps of the run done, %"),
-    ]
+    counts = {name: np.histogram([100 * k.done for k in each.kills], edges)[0] for name, each in killed.items()}
+    panel = Panel(
+        [Series(name, x=count[::-1], bar=True) for name, count in counts.items()],
+        rows=[f"{low:.0f}–{low + 5:.0f}" for low in edges[-2::-1]],
+        stacked=True,
+        x_label="kills",
+        title="steps of the run done, %",
+    )
     return Picture(
         name="stability_faults",
-        title="Phases of the kills",
-        caption="Left: the phase of the session, from the files that it left on the disk. Right: the share of the run "
-        "that had been logged by then.",
-        content=draw(panels, columns=2),
+        title="Kills over the run",
+        caption="The share of the run that had been logged when each kill struck.",
+        content=draw([panel]),
     )
 
 

@@ -1,21 +1,21 @@
 """The vendor's Tac3D recordings: the gaps that the reader counts in them, and the time to decode their messages."""
 
-import dataclasses
 import functools
 import importlib.util
 import pathlib
 import struct
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
-from experiments.core.results import Requirement, Table, at_most, named_table
+from experiments.core.context import Context
+from experiments.core.results import ReportPart, at_most, named_table
 from experiments.core.timing import interleaved
 from sensors_io.clock import NS_PER_S, JumpingClock
 from sensors_io.devices import tac3d_messages
-from sensors_io.devices.intake import Counts, Intake
+from sensors_io.devices.intake import Intake
 from sensors_io.devices.reader import Pump, ReaderConfig
 from sensors_io.devices.replay import Replay
 from sensors_io.devices.sources import Tac3dRecording
@@ -30,28 +30,6 @@ _PART_BYTES = 1400  # of a packet: below the Ethernet's 1500
 _REPEATS = 20  # decodings in a round of timing
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RecordingCheck:
-    """One recording, through the reader and by its arrays alone.
-
-    Args:
-      name: of the recording.
-      frames: in it.
-      missing, gap_s: missing indices, largest time between two frames; by the arrays.
-      counts: of the reader.
-      read_gap_s: largest time between two samples of the reader.
-      late_s: of arrival after the mapped stamps, median and largest, [2]; NaN where arrival was not recorded.
-    """
-
-    name: str
-    frames: int
-    missing: int
-    gap_s: float
-    counts: Counts
-    read_gap_s: float
-    late_s: np.ndarray
-
-
 def recordings(data_dir: pathlib.Path | None) -> list[pathlib.Path]:
     """The vendor's recordings below a directory, which must hold some."""
     if data_dir is None:
@@ -64,8 +42,11 @@ def recordings(data_dir: pathlib.Path | None) -> list[pathlib.Path]:
     return found
 
 
-def check(path: pathlib.Path) -> RecordingCheck:
-    """Replay a recording through a reader in compressed time, and count its gaps by its arrays too."""
+def check(path: pathlib.Path) -> dict[str, Any]:
+    """Replay a recording through a reader in compressed time, and count its gaps, in ms, by its arrays too.
+
+    It is late by the time of arrival after the mapped stamp, `None` where arrival was not recorded.
+    """
     truth = tac3d_messages.load_recording(path)
     clock = JumpingClock()
     intake = Intake(capacity=len(truth.index) + 1, clock=clock)
@@ -77,15 +58,17 @@ def check(path: pathlib.Path) -> RecordingCheck:
     while intake.counts.waiting:
         times.append(intake.next(0.0).device_time_ns or 0)
     present = set(truth.index.tolist())
-    return RecordingCheck(
-        name=path.stem,
-        frames=len(truth.index),
-        missing=sum(i not in present for i in range(int(truth.index[0]), int(truth.index[-1]) + 1)),
-        gap_s=float(np.diff(truth.send_time_s).max()),
-        counts=intake.counts,
-        read_gap_s=float(np.diff(times).max()) / NS_PER_S,
-        late_s=_lateness_s(truth),
-    )
+    late_ms = [None if np.isnan(late) else 1e3 * float(late) for late in _lateness_s(truth)]
+    return {
+        "recording": path.stem,
+        "frames": len(truth.index),
+        "missing": sum(i not in present for i in range(int(truth.index[0]), int(truth.index[-1]) + 1)),
+        "counted": intake.counts.missing,
+        "largest gap": 1e3 * float(np.diff(truth.send_time_s).max()),
+        "as seen": 1e3 * float(np.diff(times).max()) / NS_PER_S,
+        "late, median": late_ms[0],
+        "late, worst": late_ms[1],
+    }
 
 
 def _lateness_s(recording: tac3d_messages.Tac3dArrays) -> np.ndarray:
@@ -164,51 +147,39 @@ def _decode_by_yaml(layout: bytes, data: bytes) -> Mapping[str, np.ndarray]:
     return arrays
 
 
-def requirements(checks: Sequence[RecordingCheck], decode: Mapping[str, np.ndarray]) -> tuple[Requirement, ...]:
-    """Bounds on the time of a message and on the errors of the reader on the vendor's recordings."""
-    speed = at_most("Tac3D message decoded", float(np.median(decode[CACHED])), 0.05, "ms")
-    if not checks:
-        return (speed,)
-    off = sum(abs(c.missing - c.counts.missing) for c in checks)
-    gap = max(abs(c.gap_s - c.read_gap_s) for c in checks)
-    return (
-        speed,
-        at_most("Tac3D recordings: missing indices not counted", off, 0),
-        at_most("Tac3D recordings: largest gap off by", 1e3 * gap, 0.001, "ms"),
-    )
-
-
-def recording_table(checks: Sequence[RecordingCheck]) -> Table:
-    """Gaps and lateness of the vendor's recordings."""
-    late = lambda seconds: None if np.isnan(seconds) else 1e3 * float(seconds)
-    gaps, lates = ("largest gap", "as seen"), ("late, median", "late, worst")
-    return named_table(
-        "The vendor's Tac3D recordings",
-        [
-            {
-                "recording": c.name, "frames": c.frames, "missing": c.missing, "counted": c.counts.missing,
-                "largest gap": 1e3 * c.gap_s, "as seen": 1e3 * c.read_gap_s, "late, median": late(c.late_s[0]),
-                "late, worst": late(c.late_s[1]),
-            }
-            for c in checks
-        ],
-        formats=dict.fromkeys(gaps, ".3f") | dict.fromkeys(lates, ".1f"),
-        units=dict.fromkeys([*gaps, *lates], "ms"),
-        meanings={
-            "missing": "by the arrays",
-            "counted": "by the reader",
-            "late, median": "arrival after the stamp by running minimum",
-        },
-    )  # fmt: skip
-
-
-def decoder_table(decode: Mapping[str, np.ndarray]) -> Table:
-    """Time of one message by every method."""
-    cached = np.median(decode[CACHED])
+def recording_section(data_dir: pathlib.Path | None, rounds: int, context: Context) -> list[ReportPart]:
+    """Time of a message by every method; gaps and lateness of the vendor's recordings, where they are given."""
+    paths = recordings(data_dir)
+    checks = [check(path) for path in context.each("recordings", paths)]
+    decode = decode_ms(message(paths[0] if paths else None), context.rounds("timing decoders", rounds))
+    cached = float(np.median(decode[CACHED]))
+    parts: list[ReportPart] = [
+        f"A Tac3D message decodes in {cached:.4f} ms.",
+        at_most("Tac3D message decoded", cached, 0.05, "ms"),
+    ]
+    if checks:
+        off = sum(abs(row["missing"] - row["counted"]) for row in checks)
+        gap_ms = max(abs(row["largest gap"] - row["as seen"]) for row in checks)
+        gaps, lates = ("largest gap", "as seen"), ("late, median", "late, worst")
+        parts += [
+            at_most("Tac3D recordings: missing indices not counted", off, 0),
+            at_most("Tac3D recordings: largest gap off by", gap_ms, 0.001, "ms"),
+            named_table(
+                "The vendor's Tac3D recordings",
+                checks,
+                formats=dict.fromkeys(gaps, ".3f") | dict.fromkeys(lates, ".1f"),
+                units=dict.fromkeys([*gaps, *lates], "ms"),
+                meanings={
+                    "missing": "by the arrays",
+                    "counted": "by the reader",
+                    "late, median": "arrival after the stamp by running minimum",
+                },
+            ),
+        ]
     rows = [
-        {"method": name, "median": m, "p95": float(np.quantile(ms, 0.95)), "against cached": float(m / cached)}
+        {"method": name, "median": m, "p95": float(np.quantile(ms, 0.95)), "against cached": m / cached}
         for name, ms in decode.items()
         if (m := float(np.median(ms)))
     ]
-    formats = {"median": ".4f", "p95": ".4f", "against cached": ".1f"}
-    return named_table("Time to decode one Tac3D message", rows, formats=formats, units={"median": "ms", "p95": "ms"})
+    formats, units = {"median": ".4f", "p95": ".4f", "against cached": ".1f"}, {"median": "ms", "p95": "ms"}
+    return [*parts, named_table("Time to decode one Tac3D message", rows, formats=formats, units=units)]

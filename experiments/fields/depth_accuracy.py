@@ -6,23 +6,22 @@ Without a calibration the truth is known of analytic slopes, of presses at known
 import dataclasses
 import functools
 import pathlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import cv2
 import numpy as np
 
 from experiments.core.charts import speed_against_error
 from experiments.core.context import Context
-from experiments.core.results import Cell, Column, Picture, Requirement, Table, at_least, at_most, named_table
+from experiments.core.results import Cell, Picture, ReportPart, Requirement, Table, at_least, at_most, named_table
 from experiments.core.timing import median_ms
 from experiments.fields.depth_methods import INTEGRATORS, MAPS, Integrator, SlopeMap, calibrated, depth_by
-from experiments.fields.sections import ReportPart
 from sensors_io import quality
 from sensors_io.calibration import published
 from sensors_io.calibration.circles import align_circles, find_circles
 from sensors_io.calibration.generated_presses import fitted_optics, generated_presses, near_lamps
-from sensors_io.calibration.presses import BallPresses, Touches
+from sensors_io.calibration.presses import BallPresses
 from sensors_io.calibration.validate import BallErrors, score_ball, score_presses
 from sensors_io.fields.contact import ContactConfig, changed_contacts, steepest_change
 from sensors_io.fields.depth import DepthReader
@@ -87,51 +86,37 @@ def recorded_sections(root: pathlib.Path, folds: int, rounds: int, seed: int, co
     return parts
 
 
-class CalibrationFold(NamedTuple):
-    """Presses of a calibration with their touches; the others with theirs [n, 3], and their indices [n]."""
+def held_out_errors(
+    presses: BallPresses, folds: int, seed: int, context: Context
+) -> tuple[dict[str, BallErrors], dict[str, SlopeMap]]:
+    """Errors of every press by each of `MAPS` made without it; the maps of the first fold.
 
-    train: BallPresses
-    train_touches: Touches
-    rest: BallPresses
-    rest_touches: np.ndarray
-    rest_index: np.ndarray
-
-
-def folds_of(presses: BallPresses, folds: int, seed: int, context: Context) -> list[CalibrationFold]:
-    """Circles of each fold's training presses; those of the rest are found by the optics of the training presses."""
-    order, found = np.random.default_rng(seed).permutation(len(presses)), []
-    for k in context.each("finding circles", range(folds)):
+    The circles of a fold's training presses are found without labels, those of the rest by the optics of these.
+    """
+    order, first = np.random.default_rng(seed).permutation(len(presses)), dict[str, SlopeMap]()
+    rows = {kind: np.full((3, len(presses)), np.nan) for kind in MAPS}
+    for k in context.each("folds", range(folds)):
         out = order[k::folds]
         train, rest = presses.chosen(np.setdiff1d(order, out)), presses.chosen(out)
         circles = find_circles(train)
         touches = align_circles(rest, circles.optics).touches.stacked()
-        found.append(CalibrationFold(train, circles.touches, rest, touches, out))
-    return found
-
-
-def held_out_errors(
-    folds: Sequence[CalibrationFold], make: Callable[[BallPresses, Touches, int], SlopeMap], seed: int
-) -> BallErrors:
-    """Errors of every press by a map that was made without it."""
-    rows = np.full((3, sum(len(fold.rest_index) for fold in folds)), np.nan)
-    for fold in folds:
-        read = make(fold.train, fold.train_touches, seed)
-        for i, picture, touch in zip(fold.rest_index, fold.rest.pictures, fold.rest_touches, strict=True):
-            depth = depth_by(read, picture, fold.rest.mm_per_px)
-            rows[:, i] = *score_ball(depth, touch, fold.rest.radius_mm, fold.rest.mm_per_px), depth.max()
-    return BallErrors(depth_um=rows[0], radius_share=rows[1], tip_mm=rows[2])
+        maps = {kind: make(train, circles.touches, seed) for kind, make in MAPS.items()}
+        first = first or maps
+        for kind, read in maps.items():
+            for i, picture, touch in zip(out, rest.pictures, touches, strict=True):
+                depth = depth_by(read, picture, rest.mm_per_px)
+                rows[kind][:, i] = *score_ball(depth, touch, rest.radius_mm, rest.mm_per_px), depth.max()
+    errors = {kind: BallErrors(depth_um=um, radius_share=r, tip_mm=tip) for kind, (um, r, tip) in rows.items()}
+    return errors, first
 
 
 def held_out_section(
     presses: BallPresses, name: str, folds: int, rounds: int, seed: int, context: Context
 ) -> list[ReportPart]:
     """All maps on the presses of one real sensor."""
-    parts = folds_of(presses, folds, seed, context)
-    errors = {kind: held_out_errors(parts, make, seed) for kind, make in context.each("maps", MAPS.items())}
-    calls = {}
-    for kind, make in context.each("maps to time", MAPS.items()):
-        read = make(parts[0].train, parts[0].train_touches, seed)
-        calls[kind] = functools.partial(depth_by, read, presses.pictures[0], presses.mm_per_px)
+    errors, maps = held_out_errors(presses, folds, seed, context)
+    still, pitch = presses.pictures[0], presses.mm_per_px
+    calls = {kind: functools.partial(depth_by, read, still, pitch) for kind, read in maps.items()}
     ms = median_ms(calls, context.rounds("timing maps", rounds))
     figures = {kind: error.figures() for kind, error in errors.items()}
     own = figures[PACKAGE]
@@ -184,17 +169,15 @@ def speed_section(made: Calibration, rounds: int, source: str) -> list[ReportPar
     read = DepthReader(dataclasses.replace(made, background=background))
     picture = cv2.add(background, np.full_like(background, 3))
     ms = median_ms({"depth": lambda: read(picture)}, range(rounds))["depth"]
-    speed = at_least(
-        f"picture to depth and contact, {width} × {height}, map of {source}",
-        1e3 / ms,
-        LEAST_HZ,
-        "Hz",
-        note=f"{ms:.2f} ms, degree {made.colours.degree} in colour, {made.colours.position_degree} in place",
-    )
-    sentence = (
-        f"Depth and contact are computed at {speed.measured:.0f} Hz from pictures of {width} × {height} on one core"
-    )
-    return [f"{sentence}, with the calibration of {source}.", speed]
+    return [
+        at_least(
+            f"picture to depth and contact, {width} × {height}, map of {source}",
+            1e3 / ms,
+            LEAST_HZ,
+            "Hz",
+            note=f"{ms:.2f} ms, degree {made.colours.degree} in colour, {made.colours.position_degree} in place",
+        )
+    ]
 
 
 def ball_requirements(
@@ -261,17 +244,24 @@ def scale_error(
 def integrator_section(rounds: Iterable[object]) -> list[ReportPart]:
     """Every integrator on every analytic surface, and its time."""
     surfaces = analytic_surfaces()
-    errors = {name: [scale_error(f, *surface) for surface in surfaces.values()] for name, f in INTEGRATORS.items()}
+    errors = {
+        name: {at: scale_error(f, *surface) for at, surface in surfaces.items()} for name, f in INTEGRATORS.items()
+    }
     slope_x, slope_y = (a.astype(np.float32) for a in surfaces["ball, centre"][1:])
     ms = median_ms({name: functools.partial(f, slope_x, slope_y, PITCH_MM) for name, f in INTEGRATORS.items()}, rounds)
-    worst = max(abs(scale) for scale, _ in errors["this, Neumann"])
-    columns = [Column(name="integrator")]
-    for name in surfaces:
-        columns += [Column(name=f"scale, {name}", unit="%", format="+.2f"), Column(name="rmse", unit="µm")]
-    table = Table(
-        title="Slopes to depth on analytic surfaces",
-        columns=(*columns, Column(name="time a frame", unit="ms", format=".2f")),
-        rows=tuple((name, *(value for pair in errors[name] for value in pair), ms[name]) for name in INTEGRATORS),
+    worst = max(abs(scale) for scale, _ in errors["this, Neumann"].values())
+    scales, rmses = ({at: f"{what}, {at}" for at in surfaces} for what in ("scale", "rmse"))
+    table = named_table(
+        "Slopes to depth on analytic surfaces",
+        [
+            {"integrator": name}
+            | {scales[at]: scale for at, (scale, _) in by_surface.items()}
+            | {rmses[at]: rmse for at, (_, rmse) in by_surface.items()}
+            | {"time a frame": ms[name]}
+            for name, by_surface in errors.items()
+        ],
+        formats=dict.fromkeys(scales.values(), "+.2f") | {"time a frame": ".2f"},
+        units=dict.fromkeys(scales.values(), "%") | dict.fromkeys(rmses.values(), "µm") | {"time a frame": "ms"},
         note="Other projects' integrators are reimplemented with the faults that they ship with.",
     )
     scale = at_most("scale of depth from analytic slopes, worst of centre and border", worst, MOST_SCALE, "%")
@@ -293,22 +283,15 @@ def known_depth_section(root: pathlib.Path, seed: int, context: Context) -> list
             depth = depth_by(read, picture, presses.mm_per_px, integrate)
             error = 1e3 * (np.maximum(depth, 0) - truth)[mask]
             found.setdefault(f"{name}, {shape}", []).append((float(np.sqrt(np.mean(error**2))), float(np.std(error))))
-    rows = []
     for name in borders:
-        of_border = {row: pairs for row, pairs in found.items() if row.startswith(name)}
-        rows += [*of_border.items(), (f"{name}, all", [pair for pairs in of_border.values() for pair in pairs])]
-    means = {row: np.mean(pairs, axis=0) for row, pairs in rows}
-    (rmse, shape_only), fixed = means["Neumann, all"], means["Dirichlet, all"]
+        found[f"{name}, all"] = [pair for row, pairs in found.items() if row.startswith(name) for pair in pairs]
+    means = {row: np.mean(pairs, axis=0).tolist() for row, pairs in sorted(found.items())}
+    rmse, shape_only = means["Neumann, all"]
     table = named_table(
         "Presses at known depth (gelsight_sim2real)",
         [
-            {
-                "border and shape": row,
-                "presses": len(pairs),
-                "rmse": float(means[row][0]),
-                "offset removed": float(means[row][1]),
-            }
-            for row, pairs in rows
+            {"border and shape": row, "presses": len(found[row]), "rmse": mean, "offset removed": left}
+            for row, (mean, left) in means.items()
         ],
         formats={"presses": "d", "rmse": ".1f", "offset removed": ".1f"},
         units={"rmse": "µm", "offset removed": "µm"},
@@ -317,7 +300,6 @@ def known_depth_section(root: pathlib.Path, seed: int, context: Context) -> list
         "known to about 50 µm.",
     )
     return [
-        f"At known press depth the mean rmse is {rmse:.0f} µm, {fixed[0]:.0f} µm with a fixed border.",
         at_most("known press depth, mean rmse", rmse, MOST_UM, "µm"),
         at_most("known press depth, offset removed", shape_only, MOST_SHAPE_UM, "µm"),
         table,
@@ -355,6 +337,7 @@ def contact_section(root: pathlib.Path, seed: int) -> list[ReportPart]:
         **{n: rejections(p.pictures, p.background, p.mm_per_px, calibrated(p, seed)) for n, p in presses.items()},
     }
     rejected, real = found["feelanyforce"][1], sum(found[name][1] for name in presses)
+    contacts = sum(map(len, presses.values()))
     rows = published.feelanyforce_rows(root)
     empty, flagged = np.isnan(rows).all(1), quality.incomplete(rows)
     table = named_table(
@@ -368,10 +351,8 @@ def contact_section(root: pathlib.Path, seed: int) -> list[ReportPart]:
         f"{1e3 * config.high_mm:g} µm and a slope of {config.rim:g}.",
     )
     return [
-        f"{rejected} of {len(frames)} pictures without contact are rejected, {real} of "
-        f"{sum(map(len, presses.values()))} real contacts.",
-        at_most("pictures without contact that pass", len(frames) - rejected, 0.0),
-        at_most("real contacts that are rejected, by colour or by depth", real, 0.0),
+        at_most("pictures without contact that pass", len(frames) - rejected, 0.0, note=f"of {len(frames)}"),
+        at_most("real contacts that are rejected, by colour or by depth", real, 0.0, note=f"of {contacts}"),
         at_most("rows flagged wrongly or not", int(np.count_nonzero(flagged != empty)), 0.0),
         table,
     ]

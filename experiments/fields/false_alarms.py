@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 
 from experiments.core.context import Context
-from experiments.core.results import at_most, named_table
-from experiments.fields.sections import ReportPart
+from experiments.core.results import ReportPart, at_most, named_table
 from sensors_io.calibration.published import load, reduced
 from sensors_io.fields.deformation import DeformationReader
 from sensors_io.fields.evidence import Pattern, examine

@@ -12,10 +12,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from experiments.core.charts import Panel, Rule, Series, draw
-from experiments.core.results import Picture, Table, at_most, named_table
+from experiments.core.results import ReportPart, Table, at_most, named_table
 from experiments.fields.known_motion import NOISE_GREY, PEAK_PX, REST_PICTURES, GelCamera, MarkerGel, grey
-from experiments.fields.sections import ReportPart
 from experiments.fields.trackers import FOLLOWERS
 
 METHODS = ("this", "this, affine alone", "this, LK alone", "LK frame to frame")
@@ -136,7 +134,6 @@ def drift_section(
         ),
         _cycle_table(drift[first], first),
         _noise_table(drift, still),
-        _picture(drift[first], bound, first),
     ]
 
 
@@ -180,20 +177,4 @@ def _noise_table(drift: Mapping[str, DriftErrors], still: Mapping[str, Mapping[s
             "the same, all unknown": "light and strain estimated from the same window",
         },
         note=f"Median over markers, pixels of a picture 320 wide; noise of {NOISE_GREY:g} grey levels.",
-    )
-
-
-def _picture(errors: DriftErrors, bound: float, gel: str) -> Picture:
-    series = []
-    for name, by_cycle in errors.items():
-        low, middle, high = np.array([np.nanquantile(e, (0.25, 0.5, 0.75)) for e in by_cycle.values()]).T
-        series.append(Series(name, x=list(by_cycle), y=middle, low=low, high=high, band=True, marker="o"))
-    rules = [Rule(y=bound, name="Cramér–Rao bound of each marker alone")]
-    x_label = f"cycles of {PERIOD} pictures"
-    panel = Panel(series, x_label=x_label, y_label="off, px", x_scale="log", y_scale="log", rules=rules)
-    return Picture(
-        name="fields_drift",
-        title=f"What grows with time, {gel}",
-        caption="Median and quartiles over the markers, the gel at rest again after every cycle.",
-        content=draw([panel]),
     )

@@ -21,7 +21,7 @@ import pathlib
 from collections.abc import Callable
 
 from experiments.core.context import Context
-from experiments.core.results import Results
+from experiments.core.results import ReportPart, Results, assemble
 from experiments.core.runner import Experiment
 from experiments.fields.depth_accuracy import (
     contact_section,
@@ -33,7 +33,6 @@ from experiments.fields.depth_accuracy import (
 from experiments.fields.false_alarms import pattern_section
 from experiments.fields.known_motion import gels
 from experiments.fields.marker_drift import drift_section
-from experiments.fields.sections import ReportPart, assemble
 from experiments.fields.shear_accuracy import layer_section, shear_section
 from experiments.fields.tracking_accuracy import dense_section, marker_section
 
@@ -42,25 +41,15 @@ PICTURES = 20  # pictures of each folder for the recognition of marker gels
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FieldsConfig:
-    """Sizes of the measurements.
+    """Sizes of the measurements."""
 
-    Args:
-      data_dir: folder of the recordings; `None` for generated input alone.
-      rounds: of timing.
-      folds: of the presses.
-      generated_presses: of each generated ball.
-      strange_lamps: measure balls under lamps that the calibration's model does not cover, too.
-      motion: measure the fields of motion, too.
-      seed: of folds and generated presses.
-    """
-
-    data_dir: pathlib.Path | None = None
-    rounds: int = 51
-    folds: int = 5
-    generated_presses: int = 24
-    strange_lamps: bool = True
-    motion: bool = True
-    seed: int = 0
+    data_dir: pathlib.Path | None = None  # folder of the recordings; `None` for generated input alone
+    rounds: int = 51  # of timing
+    folds: int = 5  # of the presses
+    generated_presses: int = 24  # of each generated ball
+    strange_lamps: bool = True  # measure balls under lamps that the calibration's model does not cover, too
+    motion: bool = True  # measure the fields of motion, too
+    seed: int = 0  # of folds and generated presses
 
 
 def run(config: FieldsConfig, context: Context) -> Results:

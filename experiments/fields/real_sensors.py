@@ -10,20 +10,16 @@ with too few presses, no ball or no zero level depth is refused or flagged, not 
 """
 
 import dataclasses
+import itertools
 import pathlib
 import textwrap
 import time
-from collections.abc import Sequence
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from scipy import ndimage
 
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
-from experiments.core.look import LOOK, PALETTE, png
+from experiments.core.pictures import image_grid
 from experiments.core.results import Cell, Picture, Results, named_table
 from experiments.core.runner import Experiment
 from sensors_io.calibration.calibrate import CalibrateConfig, calibrate
@@ -32,23 +28,17 @@ from sensors_io.calibration.published import FOLDERS, RecordingFolder, read_fold
 from sensors_io.fields.extract import Extractor
 from sensors_io.fields.types import Calibration, CalibrationError, Fields
 from sensors_io.schema import Flag
+from sensors_io.viewer.panels import arrows, coloured, outlined, with_bar
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RealConfig:
-    """Folders to read.
+    """Folders to read."""
 
-    Args:
-      data_dir: the folder of recordings.
-      folders: at most so many of them.
-      shown: pictures drawn of each.
-      folds: of the held-out errors.
-    """
-
-    data_dir: pathlib.Path | None = None
-    folders: int = 99
-    shown: int = 5
-    folds: int = 5
+    data_dir: pathlib.Path | None = None  # the folder of recordings
+    folders: int = 99  # at most so many of them
+    shown: int = 5  # pictures drawn of each
+    folds: int = 5  # of the held-out errors
 
 
 HELD_OUT = {
@@ -58,7 +48,7 @@ HELD_OUT = {
 }
 """Column → figure of a calibration on the presses left out of it."""
 
-_FLAGS = 42  # letters of a line of flags
+LETTERS = 18  # of a line beside the pictures
 
 
 def run(config: RealConfig, context: Context) -> Results:
@@ -113,12 +103,15 @@ def folder_report(
     row |= held_out | {"no contact": rejected, "no zero level": floating, "all fields": hz}
     chosen = np.linspace(0, len(frames) - 1, min(config.shown, len(frames))).round().astype(int)
     changes = np.clip(128 + (frames[chosen].astype(np.int16) - background), 0, 255).astype(np.uint8)
+    rows = {
+        row_name(names[i], int(fields.flags[i])): field_pictures(fields, i, change)
+        for i, change in zip(chosen, changes, strict=True)
+    }
     picture = Picture(
         name=name.replace(",", "").replace(" ", "-"),
         title=name,
-        caption=". ".join(s for s in (folder.remark, *extractor.refused) if s)
-        or "Change of colour, depth, contact, deformation.",
-        content=field_rows(fields, chosen, [names[i] for i in chosen], changes),
+        caption=". ".join(s for s in (folder.remark, *extractor.refused) if s),
+        content=image_grid(rows, ("change, contact", "depth", "deformation"), cell_inch=2.2),
         kind="png",
     )
     return row, note, picture
@@ -142,67 +135,24 @@ def _calibrated(
     return made, {column: figures[key] for column, key in HELD_OUT.items()}, f"{len(report.left_out)} presses left out"
 
 
-def field_rows(fields: Fields, chosen: np.ndarray, names: Sequence[str], changes: np.ndarray) -> bytes:
-    """A PNG of one row a chosen picture: `changes` of colour, depth, its profile, deformation.
-
-    `fields` are those of all pictures; `names` and `changes`, uint8 [n, H, W, 3], of the chosen ones alone.
-    """
-    with mpl.rc_context(LOOK):
-        figure = Figure(figsize=(11, 2.2 * len(chosen) + 0.3), dpi=110, layout="constrained")
-        grid = figure.subplots(len(chosen), 4, squeeze=False)
-        for (seen, depth, profile, moved), i, name, change in zip(grid, chosen, names, changes, strict=True):
-            flags = Flag(int(fields.flags[i])) & ~Flag.REFUSED
-            words = ", ".join(str(f.name).lower().replace("_", " ") for f in Flag if f & flags) or "no flag"
-            seen.imshow(change)
-            seen.set_title("\n".join((name, *textwrap.wrap(words, _FLAGS))), fontsize=7, loc="left")
-            seen.set_axis_off()
-            contact, pitch = fields.contact[i], fields.mm_per_px
-            height, width = (n * pitch for n in contact.shape)
-            _draw_depth(depth, None if fields.depth_mm is None else fields.depth_mm[i], contact, (width, height))
-            _draw_profile(profile, None if fields.depth_mm is None else fields.depth_mm[i], contact, pitch)
-            _draw_motion(moved, None if fields.deformation_mm is None else fields.deformation_mm[i], (width, height))
-        return png(figure)
+def field_pictures(fields: Fields, i: int, change: np.ndarray) -> list[np.ndarray]:
+    """Change of colour with the contact outlined, depth and deformation of picture i; white where there is none."""
+    shown = [outlined(change, fields.contact[i])]
+    for field, draw in ((fields.depth_mm, coloured), (fields.deformation_mm, arrows)):
+        if field is None:
+            shown.append(np.full((1, 1, 3), 255, np.uint8))
+            continue
+        size = field[i] if field.ndim == 3 else np.linalg.norm(field[i], axis=-1)
+        top_mm = float(f"{max(float(np.nanmax(size)), 0.01):.2g}")
+        shown.append(with_bar(draw(field[i], top_mm), top_mm))
+    return shown
 
 
-def _draw_depth(axes: Axes, depth_mm: np.ndarray | None, contact: np.ndarray, size_mm: tuple[float, float]) -> None:
-    window = (0, size_mm[0], size_mm[1], 0)
-    if depth_mm is None:
-        axes.imshow(contact, cmap="Greys", extent=window)
-        axes.set_title("contact, by colour", fontsize=7)
-    else:
-        axes.figure.colorbar(axes.imshow(depth_mm, cmap="cividis", vmin=0, extent=window), ax=axes)
-        axes.set_title("depth, mm", fontsize=7)
-    if contact.any() and not contact.all():
-        x, y = (np.linspace(0, side, n) for side, n in zip(size_mm, contact.shape[::-1], strict=True))
-        axes.contour(x, y, contact, [0.5], colors="w", linewidths=0.8)
-    axes.grid(False)
-
-
-def _draw_profile(axes: Axes, depth_mm: np.ndarray | None, contact: np.ndarray, mm_per_px: float) -> None:
-    """Depth along the row and the column of the deepest pixel, where possible of a contact inside the picture."""
-    if depth_mm is None:
-        axes.set_axis_off()
-        return
-    labels, _ = ndimage.label(contact)
-    at_border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
-    inner = contact & ~np.isin(labels, at_border)
-    y, x = np.unravel_index(int(np.where(inner | ~inner.any(), depth_mm, -np.inf).argmax()), depth_mm.shape)
-    for values, label in ((depth_mm[y], "along x"), (depth_mm[:, x], "along y")):
-        axes.plot(np.arange(len(values)) * mm_per_px, values, lw=1, label=label)
-    axes.set(xlabel="mm", ylabel="depth, mm")
-    axes.legend(fontsize=7)
-
-
-def _draw_motion(axes: Axes, moved_mm: np.ndarray | None, size_mm: tuple[float, float]) -> None:
-    if moved_mm is None:
-        axes.text(0.5, 0.5, "no markers:\nrefused", ha="center", va="center", fontsize=8, transform=axes.transAxes)
-        axes.set_axis_off()
-        return
-    width, height = size_mm
-    x, y = ((np.arange(n) + 0.5) / n * side for n, side in zip(moved_mm.shape[1::-1], size_mm, strict=True))
-    axes.quiver(x, y, moved_mm[..., 0], moved_mm[..., 1], angles="xy", color=PALETTE[0])
-    axes.set(aspect="equal", xlim=(0, width), ylim=(height, 0))
-    axes.set_title(f"greatest {np.hypot(*np.moveaxis(moved_mm, -1, 0)).max():.2f} mm", fontsize=7)
+def row_name(name: str, flags: int) -> str:
+    """The name of a picture and its flags, but for those that say what is refused in all pictures."""
+    words = [str(f.name).lower().replace("_", " ") for f in Flag if f & flags & ~Flag.REFUSED]
+    lines = (textwrap.wrap(part, LETTERS) for part in (name, ", ".join(words) or "no flag"))
+    return "\n".join(itertools.chain(*lines))
 
 
 EXPERIMENT = Experiment(

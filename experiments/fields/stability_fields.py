@@ -2,14 +2,11 @@
 
     python -m experiments stability_fields --data-dir DIR [--scale smoke]
 
-Known motion on pictures of marker gels (generated ones without `--data-dir`), under seven stresses from harmless to
-hopeless: displacement, frame gaps, lost dots, noise, exposure down and up to saturation, contact at the border.  Shear
-is stressed on generated slides, by noise, lost nodes and a layer other than the assumed one; depth on generated presses
-of a ball, by noise, exposure, drifting lamps, contact at the border, too large and too steep.  A method fails if more
-than 5 % of its points are a pixel off, if the error of shear exceeds half of the shear, or that of depth a fifth of the
-press; the curves show where methods fail and whether a flag was set.  Two further tables count flags on real pictures,
-and bare gels taken for marker gels, in every folder of the data directory.  None of the tracker's settings was chosen
-on these pictures, motions or noise.
+Known motion on pictures of marker gels, generated ones without `--data-dir`; shear on generated slides; depth on
+generated presses of a ball; each under stresses from harmless to hopeless.  A method fails if more than 5 % of its
+points are a pixel off, if the error of shear exceeds half of the shear, or that of depth a fifth of the press.  Two
+further tables count flags on real pictures, and bare gels taken for marker gels.  None of the tracker's settings was
+chosen on these pictures, motions or noise.
 
 Six minutes on one core (`smoke` half a minute).  Expected: the package's tracker fails last and never without a flag;
 methods that match from frame to frame or to the nearest dot fail at half a pitch without a flag.
@@ -20,11 +17,10 @@ import itertools
 import pathlib
 
 from experiments.core.context import Context
-from experiments.core.results import Results
+from experiments.core.results import Results, assemble
 from experiments.core.runner import Experiment
 from experiments.fields.false_alarms import flag_section, pattern_section
 from experiments.fields.known_motion import gels
-from experiments.fields.sections import assemble
 from experiments.fields.stress import OURS, gathered, silent_frames, stress_section
 from experiments.fields.stressed_readings import DEPTH, SHEAR, TRACKING, attempt_depth, attempt_shear, attempt_tracking
 from touchr1_jax.validation import at_least
@@ -34,26 +30,16 @@ METHODS = (OURS, "this, LK alone", "LK to rest", "LK frame to frame", "DIS mediu
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FieldStabilityConfig:
-    """Sizes of the measurements.
+    """Sizes of the measurements."""
 
-    Args:
-      data_dir: folder of the recordings; `None` for generated gels alone.
-      gels, seeds: gels, and motions of each; presses under each level for depth.
-      methods: of tracking.
-      slide_frames: of the slide that shear is read on.
-      ball_presses: that the calibration of depth is made with.
-      pictures: of each folder, for the recognition of marker gels.
-      seed: the first one.
-    """
-
-    data_dir: pathlib.Path | None = None
+    data_dir: pathlib.Path | None = None  # folder of the recordings; `None` for generated gels alone
     gels: int = 3
-    seeds: int = 2
-    methods: tuple[str, ...] = METHODS
-    slide_frames: int = 36
-    ball_presses: int = 24
-    pictures: int = 60
-    seed: int = 900
+    seeds: int = 2  # motions of each gel, and presses under each level for depth
+    methods: tuple[str, ...] = METHODS  # of tracking
+    slide_frames: int = 36  # of the slide that shear is read on
+    ball_presses: int = 24  # that the calibration of depth is made with
+    pictures: int = 60  # of each folder, for the recognition of marker gels
+    seed: int = 900  # the first one
 
     def __post_init__(self) -> None:
         at_least(self, 1, "gels", "seeds", "pictures")

@@ -1,17 +1,14 @@
 """Methods under growing stress: the level at which each one breaks, and whether a flag warns of it."""
 
 import collections
-import itertools
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from experiments.core.charts import Panel, Rule, Series, draw
-from experiments.core.look import PALETTE, SHARED
-from experiments.core.results import Picture, Table, at_most, named_table
+from experiments.core.results import Picture, ReportPart, Table, at_most, named_table
 from experiments.core.text import number
-from experiments.fields.sections import ReportPart
 from sensors_io.fields.deformation import LOST_SHARE
 from sensors_io.schema import Flag
 
@@ -113,29 +110,14 @@ def break_table(field: StressedField, outcomes: StressOutcomes) -> Table:
 
 def _curves(field: StressedField, outcomes: StressOutcomes) -> bytes:
     """The worst error of every method by level, one panel a stress, clipped to two decades around the tolerance."""
-    colours = dict(zip(outcomes, itertools.cycle((*PALETTE, SHARED)), strict=False))
     first, tolerance = next(iter(outcomes)), field.tolerance
     panels = []
     for i, (stress, levels) in enumerate(field.stresses.items()):
-        series, marks = [], collections.defaultdict[str, list[tuple[int, float, str]]](list)
+        series = []
         for method in reversed(tuple(outcomes)):  # the first method is drawn last, over the others
-            found = [outcomes[method][stress, level] for level in levels]
-            error = np.clip([max(o.error for o in frames) for frames in found], 0.01 * tolerance, 100 * tolerance)
-            width = 2.4 if method == first else 1.1
-            series.append(Series(method, x=range(len(levels)), y=error, marker="", colour=colours[method], width=width))
-            for x, frames in enumerate(found):
-                if all(o.flags for o in frames):
-                    marks["flagged in every frame"].append((x, error[x], colours[method]))
-            broken = [x for x, frames in enumerate(found) if any(o.broken for o in frames)]
-            if broken:
-                silent = any(o.silent for o in found[broken[0]])
-                name = "breaks here without a flag" if silent else "breaks here with a flag"
-                marks[name].append((broken[0], error[broken[0]], colours[method]))
-        for name, (marker, size, hollow) in _MARKS.items():
-            if marks[name]:
-                at, height, colour = zip(*marks[name], strict=True)
-                look: dict[str, Any] = {"line": "", "marker": marker, "size": size, "hollow": hollow}
-                series.append(Series(name, x=at, y=height, colour=colour, **look))
+            worst = [max(o.error for o in outcomes[method][stress, level]) for level in levels]
+            error, width = np.clip(worst, 0.01 * tolerance, 100 * tolerance), 2.4 if method == first else 1.1
+            series.append(Series(method, x=range(len(levels)), y=error, marker="", width=width))
         panel = Panel(
             series,
             title=stress,
@@ -148,10 +130,3 @@ def _curves(field: StressedField, outcomes: StressOutcomes) -> bytes:
         panels.append(panel)
     rows = -(-len(panels) // 4)
     return draw(panels, columns=4, size=(2.75 * min(4, len(panels)) + 0.6, 2.45 * rows + 0.8), share_y=True)
-
-
-_MARKS = {
-    "flagged in every frame": ("o", 25, True),
-    "breaks here without a flag": ("X", 64, False),
-    "breaks here with a flag": ("s", 64, True),
-}

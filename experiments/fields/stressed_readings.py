@@ -39,8 +39,7 @@ from sensors_io.quality import QualityConfig, saturated
 from sensors_io.scenes.sensors import TAC3D, SensorModel
 from sensors_io.schema import Flag
 
-Attempt = tuple[str, str, float, StressOutcome]
-"""Method, stress, level, outcome."""
+Attempt = tuple[str, str, float, StressOutcome]  # method, stress, level, outcome
 
 TRACKING = StressedField(
     name="tracking",

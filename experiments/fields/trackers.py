@@ -13,8 +13,7 @@ import numpy as np
 from sensors_io.fields.markers import find_markers
 from sensors_io.fields.tracking import Tracker, TrackingConfig
 
-Follower = Callable[[np.ndarray], np.ndarray]
-"""From the next picture, uint8 [H, W], to the points in it."""
+Follower = Callable[[np.ndarray], np.ndarray]  # from the next picture, uint8 [H, W], to the points in it
 
 MakeFollower = Callable[[np.ndarray, np.ndarray, int], Follower]
 """From the picture at rest, the points and the half side of the windows to a follower."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from experiments.core.charts import Point, speed_against_error
 from experiments.core.context import Context
-from experiments.core.results import Cell, Column, Picture, Table, at_least, at_most
+from experiments.core.results import Cell, Column, Picture, ReportPart, Table, at_least, at_most
 from experiments.core.timing import median_ms
 from experiments.fields.known_motion import (
     FIRST_SEED,
@@ -20,7 +20,6 @@ from experiments.fields.known_motion import (
     MarkerGel,
     grey,
 )
-from experiments.fields.sections import ReportPart
 from experiments.fields.trackers import FLOWS, FOLLOWERS, Follower
 from sensors_io.fields.deformation import DeformationReader
 from sensors_io.fields.spline import Densifier
@@ -124,25 +123,25 @@ def marker_section(gels: Sequence[MarkerGel], context: Context) -> list[ReportPa
         at_most("28 px jump: markers lost or > 1 px off, worst gel", worst_jump, 0.0),
         markers,
         jump_table,
-        _marker_picture(errors[first], ms[first], first),
+        _picture(
+            "fields_markers",
+            f"Markers: speed against error, {first}",
+            "Distance from the truth under known motion; bars reach from the median to the 95th percentile. Without "
+            "smoothing this package's point does not move.",
+            {m: (*quantiles(e), ms[first][m]) for m, e in errors[first].items() if m != UNSMOOTHED},
+        ),
     ]
 
 
-def _marker_picture(errors: Mapping[str, np.ndarray], ms: Mapping[str, float], gel: str) -> Picture:
+def _picture(name: str, title: str, caption: str, methods: Mapping[str, tuple[float, float, float]]) -> Picture:
+    """Error, its 95th percentile and milliseconds of every method that does not lose most points."""
     groups: dict[str, list[Point]] = {}
-    for method in FOLLOWERS:
-        median, high = quantiles(errors[method])
-        if np.isfinite(median) and method != UNSMOOTHED:  # which coincides with the smoothed one
-            kind = "this package" if method.startswith("this") else method.split(" ")[0].rstrip(",")
-            top = high if np.isfinite(high) else 10 * median
-            groups.setdefault(kind, []).append((method, ms[method], median, top))
-    return Picture(
-        name="fields_markers",
-        title=f"Markers: speed against error, {gel}",
-        caption="Distance from the truth under known motion; bars reach from the median to the 95th percentile. "
-        "Without smoothing this package's point does not move.",
-        content=speed_against_error(groups, "error, px", None, legend=False),
-    )
+    for method, (error, high, ms) in methods.items():
+        if np.isfinite(error):
+            top = high if np.isfinite(high) else 10 * error
+            groups.setdefault(method.split(" ")[0].rstrip(",:"), []).append((method, ms, error, top))
+    content = speed_against_error(groups, "error, px", None, legend=False)
+    return Picture(name=name, title=title, caption=caption, content=content)
 
 
 def dense_section(rounds: int, gels: Sequence[MarkerGel], context: Context) -> list[ReportPart]:
@@ -153,27 +152,22 @@ def dense_section(rounds: int, gels: Sequence[MarkerGel], context: Context) -> l
     densify = Densifier(tracker.spline, gels[0].picture.shape[:2])
     moved = gels[0].motion(PEAK_PX, None).forward(gels[0].points_px)
     spline_ms = median_ms({"": functools.partial(densify, moved)}, range(max(rounds, 30)))[""]
-    points: dict[str, list[Point]] = {}
-    for method, (mean, high, ms) in measured[first].items():
-        points.setdefault(method.split(" ")[0].rstrip(":"), []).append((method, ms, mean, high))
     table = _gel_table(
         "Dense displacement under known motion",
         measured,
         _accuracy_columns("mean"),
         note="Over the inner four fifths of height and width; the time is that from picture to field.",
     )
-    picture = Picture(
-        name="fields_dense",
-        title=f"Dense field: speed against error, {first}",
-        caption="Mean distance from the truth; bars reach to the 95th percentile.",
-        content=speed_against_error(points, "error, px", None, legend=False),
-    )
     return [
-        f"Between the markers the mean error of the spline is {error:.3f} px; it takes {spline_ms:.2f} ms.",
         at_most("dense field, mean error", error, 0.05, "px"),
         at_least("markers → dense field", 1e3 / spline_ms, 1000, "Hz"),
         table,
-        picture,
+        _picture(
+            "fields_dense",
+            f"Dense field: speed against error, {first}",
+            "Mean distance from the truth; bars reach to the 95th percentile.",
+            measured[first],
+        ),
     ]
 
 

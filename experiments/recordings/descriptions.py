@@ -55,19 +55,15 @@ class DescribedVideos:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class AuxiliaryData:
-    """Data without labels of real objects: touches of generated objects and unlabelled videos.
-
-    Args:
-      scene_x, scene_target: descriptions of S sets of scenes, and their properties: levels and material one-hot, then
-        the logarithms of the physical quantities behind them, standardised.
-      kinds: [T], whether a property is of the levels, the material or the physics.
-      unlabelled: descriptions of the videos.
-    """
+    """Data without labels of real objects: touches of generated objects and unlabelled videos."""
 
     scene_x: Float[np.ndarray, "S n D"]
     scene_target: Float[np.ndarray, "S n T"]
-    kinds: np.ndarray
-    unlabelled: Float[np.ndarray, "m D"]
+    """Descriptions of S sets of scenes, and their properties: levels and material one-hot, then the logarithms of the
+    physical quantities behind them, standardised.
+    """
+    kinds: np.ndarray  # [T], whether a property is of the levels, the material or the physics
+    unlabelled: Float[np.ndarray, "m D"]  # descriptions of the videos
 
 
 def describe_source(source: Path, frames: int, context: Context, objects: int | None = None) -> DescribedVideos:

@@ -41,21 +41,18 @@ BLOCK = 64  # numbers of videos are padded to a multiple of it
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LearnConfig:
-    """Architecture and training of an ensemble.
-
-    Args:
-      evidence: probes whose log-probabilities the encoder reads, and whose most likely levels `perceive` repeats.
-      reading, tune, reinforce: training on made-up evidence, then on the answers of real objects, then GRPO.  The last
-        two have no steps by default: labels reach the policy through the evidence, and to learn from them again costs.
-      members: policies of different seeds whose log-probabilities are averaged.
-    """
+    """Architecture and training of an ensemble."""
 
     evidence: LevelProbeConfig = LevelProbeConfig()
-    members: int = 3
+    """Probes whose log-probabilities the encoder reads, and whose most likely levels `perceive` repeats."""
+    members: int = 3  # policies of different seeds whose log-probabilities are averaged
     shape: PolicyShape = PolicyShape()
     reading: TuneConfig = READING
     tune: TuneConfig = TuneConfig(steps=0)
     reinforce: ReinforceConfig = ReinforceConfig()
+    """Training on made-up evidence, then on the answers of real objects, then GRPO. The last two have no steps by
+    default: labels reach the policy through the evidence, and to learn from them again costs.
+    """
 
     @property
     def inputs(self) -> int:

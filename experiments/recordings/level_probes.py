@@ -40,19 +40,15 @@ SCENES = tuple(f"scenes, {reading}, {group}" for reading in READINGS for group i
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LevelProbeConfig(KernelProbeConfig):
-    """The probes; families other than those of the description are the predictions of scene probes.
-
-    Args:
-      scene_ridge: λ of the scene probes, ten times that of the others: they are read on another world than they are
-        fitted on, and with λ = 1 the answers about real objects depend on which scenes were drawn.
-      rating_share: of the ratings in the targets, see `graded_targets`.
-      rating_width: of their kernel, on the scale of 0 to 10.
-    """
+    """The probes; families other than those of the description are the predictions of scene probes."""
 
     families: tuple[str, ...] = SCENES
     scene_ridge: float = 10.0
-    rating_share: float = 0.5
-    rating_width: float = 1.0
+    """λ of the scene probes, ten times that of the others: they are read on another world than they are fitted on, and
+    with λ = 1 the answers about real objects depend on which scenes were drawn.
+    """
+    rating_share: float = 0.5  # of the ratings in the targets, see `graded_targets`
+    rating_width: float = 1.0  # of their kernel, on the scale of 0 to 10
 
 
 class ProbedVideos:

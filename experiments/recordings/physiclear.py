@@ -56,10 +56,14 @@ from touchr1_jax.bench.statistics import Interval
 from touchr1_jax.models.description_policy import LANGUAGE, choose, description_policy
 
 POLICY = "policy.npz"  # file of the policy of all objects in a run
-GOALS: Mapping[str, float] = {"all right": 44.0, "mean": 72.5, "OMAE": 0.315}
-POOLED: Mapping[str, float] = {"all right": 49.0, "mean": 76.5, "OMAE": 0.26}
-SUREST: Mapping[str, float] = {"all right": 55.0, "mean": 80.0}
-HALF = 0.5
+ONE, ALL, SUREST = "", "all videos: ", "surest half: "
+GOALS: Mapping[str, Mapping[str, float]] = {
+    ONE: {"all right": 44.0, "mean": 72.5, "OMAE": 0.315},
+    ALL: {"all right": 49.0, "mean": 76.5, "OMAE": 0.26},
+    SUREST: {"all right": 55.0, "mean": 80.0},
+}
+"""Answers to one video, to all of an object, and the half that it is surest of → score → its bound."""
+
 MINUTES = 15.0  # bound of the time for scenes and one partition, all folds together
 DEVELOPMENT = 101  # seed of the partition that ablations and curves are measured on
 UNSURE = 0.3  # probability that all three are right, below which an answer says that it is unsure
@@ -74,27 +78,20 @@ _LIMITS = "Probes alone, on that partition too.  To have touched the object befo
 class PhysiclearStudy:
     """Training, validation, and objects left out."""
 
-    data_dir: Path | None = None
-    """Folder with labels.json and videos/; needed to train."""
+    data_dir: Path | None = None  # folder with labels.json and videos/; needed to train
     predict: tuple[Path, ...] = ()
     """A folder of videos to answer for one by one, or videos of one object, instead of validating."""
-    out: Path | None = None
-    """Where the answers go, as JSON."""
+    out: Path | None = None  # where the answers go, as JSON
     policy: Path | None = None
     """The trained policy; by default that in the cache, which is trained first where data_dir is given."""
-    objects: int | None = None
-    """Labelled objects to use; all by default."""
-    frames: int = 8
-    """Frames in contact that are described of each video."""
+    objects: int | None = None  # labelled objects to use; all by default
+    frames: int = 8  # frames in contact that are described of each video
     folds: int = 10
-    seeds: tuple[int, ...] = tuple(range(1001, 1009))
-    """Of the partitions into folds, and of the training on each."""
-    ablations: bool = True
-    """Whether variants of the policy are trained too."""
+    seeds: tuple[int, ...] = tuple(range(1001, 1009))  # of the partitions into folds, and of the training on each
+    ablations: bool = True  # whether variants of the policy are trained too
     scenes: SceneConfig = SceneConfig(objects=800, sites=1)
     """Scenes that are generated for training, in addition to the videos."""
-    scene_sets: int = 3
-    """Sets of them, of consecutive seeds, whose probes are averaged."""
+    scene_sets: int = 3  # sets of them, of consecutive seeds, whose probes are averaged
     learn: LearnConfig = LearnConfig()
 
 
@@ -177,23 +174,25 @@ def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Resul
     }
     parts = elsewhere.probe_variants() | (elsewhere.policy_variants() if config.ablations else {})
     score = lambda title, rows, note: score_table(title, rows, videos.label, videos.objects, note)
-    curve, curve_table = findings.sim_to_real(elsewhere)
-    main = intervals(policy.levels, policy.truth, policy.owner)
-    all_videos = intervals(pooled.levels, policy.truth, policy.owner)
+    measured = {
+        ONE: intervals(policy.levels, policy.truth, policy.owner),
+        ALL: intervals(pooled.levels, policy.truth, policy.owner),
+        SUREST: policy.of_surest(0.5),
+    }
     gain = findings.gains(policy, regression)
     return Results(
-        verdict=verdict(main, all_videos, gain, videos, len(config.seeds)),
-        requirements=requirements(main, all_videos, policy.of_surest(HALF), gain, spent),
+        verdict=verdict(measured, gain["mean"], videos, len(config.seeds)),
+        requirements=requirements(measured, gain, spent),
         tables=(
             score_table("Unseen objects", methods, policy.truth, policy.owner, "Mean over the partitions."),
             findings.partition_table(policy, pooled, config.seeds),
             findings.people_table(people(videos), videos),
-            curve_table,
+            findings.sim_to_real(elsewhere),
             score("What contributes", {name: choose(rows) for name, rows in parts.items()}, _ELSEWHERE),
             score("What limits", elsewhere.label_limits(), _LIMITS),
             findings.object_table(videos, policy, pooled),
         ),
-        pictures=(findings.abstention(policy), curve, findings.confusions(policy)),
+        pictures=(findings.abstention(policy), findings.confusions(policy)),
         settings=settings(config, policy, videos),
         data={
             "objects": len(np.unique(videos.objects)),
@@ -239,38 +238,25 @@ def cached_policy(config: PhysiclearStudy, context: Context) -> Path:
 
 
 def requirements(
-    main: Mapping[str, Interval],
-    pooled: Mapping[str, Interval],
-    surest: Mapping[str, Interval],
-    gain: Mapping[str, Interval],
-    spent: Mapping[str, float],
+    measured: Mapping[str, Mapping[str, Interval]], gain: Mapping[str, Interval], spent: Mapping[str, float]
 ) -> tuple[Requirement, ...]:
-    """Requirements and measured figures; `spent` are the seconds of the stages that are counted."""
-    found = [output for stage, output in CACHED.items() if stage not in spent]
+    """Bounds on scores, on the gain over logistic regression and on time; `spent` are the seconds of counted stages."""
     bounds = []
-    for prefix, measured, goals in (
-        ("", main, GOALS),
-        ("all videos: ", pooled, POOLED),
-        ("surest half: ", surest, SUREST),
-    ):
+    for what, goals in GOALS.items():
         for name, goal in goals.items():
-            one = measured[name]
+            one, bound = measured[what][name], at_most if name == "OMAE" else at_least
             note = f"95 % over objects {one.low:.3g} to {one.high:.3g}"
-            bound = at_most if name == "OMAE" else at_least
-            bounds.append(bound(prefix + name, one.mean, goal, "levels" if name == "OMAE" else "%", note))
+            bounds.append(bound(what + name, one.mean, goal, "levels" if name == "OMAE" else "%", note))
     for name in ("all right", "mean"):
         note = f"gain {gain[name].mean:.1f} points, low end of its 95 % interval over objects"
         bounds.append(at_least(f"gain over logistic regression: {name}", gain[name].low, 0.0, "points", note))
+    found = [output for stage, output in CACHED.items() if stage not in spent]
     note = f"found in the cache and not counted: {', '.join(found)}" if found else "nothing was found in the cache"
     return (*bounds, at_most("data and training, one partition", sum(spent.values()) / 60, MINUTES, "min", note))
 
 
 def verdict(
-    main: Mapping[str, Interval],
-    pooled: Mapping[str, Interval],
-    gain: Mapping[str, Interval],
-    videos: DescribedVideos,
-    partitions: int,
+    measured: Mapping[str, Mapping[str, Interval]], gain: Interval, videos: DescribedVideos, partitions: int
 ) -> tuple[str, ...]:
     """The scores on unseen objects from one video and from all, and the gain over logistic regression."""
     right = lambda found: (
@@ -279,10 +265,9 @@ def verdict(
     )
     return (
         f"From one of {len(videos.names)} videos of {len(np.unique(videos.objects))} unseen objects (mean of "
-        f"{partitions} partitions): {right(main)}.",
-        f"From all videos of an object: {right(pooled)}.",
-        f"Compared with logistic regression on hand-made features: {interval(gain['mean'], '+.1f')} points of single "
-        "levels.",
+        f"{partitions} partitions): {right(measured[ONE])}.",
+        f"From all videos of an object: {right(measured[ALL])}.",
+        f"Compared with logistic regression on hand-made features: {interval(gain, '+.1f')} points of single levels.",
     )
 
 

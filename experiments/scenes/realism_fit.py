@@ -126,9 +126,9 @@ def candidates(study: PressFit) -> dict[str, RenderCandidate]:
     }
 
 
-def render(study: PressFit, candidate: RenderCandidate, seed: int) -> np.ndarray:
+def render(study: PressFit, candidate: RenderCandidate) -> np.ndarray:
     """The held-out presses by one candidate, uint8 [P, N, N, 3]; one unit, whose grain they share."""
-    rng, n = np.random.default_rng(seed), study.presses.pictures.shape[1]
+    rng, n = np.random.default_rng(0), study.presses.pictures.shape[1]
     light = _light(photometric.grain(rng, n, candidate.noise.grain, candidate.noise.shared))
     made = []
     for touch in study.touches[study.held_out]:
@@ -205,8 +205,7 @@ def _light(texture: np.ndarray) -> Light:
 
 ELEVATIONS_DEG = (10.0, 20.0, 35.0)
 DIRECTIONS = 8
-REACH_MM = np.linspace(0.25, 4.0, 12)
-"""Distances along the ray to the lamp at which the gel may stand in its way."""
+REACH_MM = np.linspace(0.25, 4.0, 12)  # distances along the ray to the lamp at which the gel may stand in its way
 
 
 def shadow_gain(study: PressFit, context: Context) -> dict[str, float]:

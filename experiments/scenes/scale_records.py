@@ -41,8 +41,7 @@ from sensors_io.schema import SENSORS
 MOST_OPEN_S, MOST_MB, MOST_FIND_MS, MOST_GROWTH = 3.0, 500.0, 1.0, 1.5
 """Requirements on the index: to open it, its memory, a contact by key, publishing late over publishing early."""
 
-Units = Mapping[str, float]
-"""Measured figures by name: those of `measure_units`, or of `index_cost`."""
+Units = Mapping[str, float]  # measured figures by name: those of `measure_units`, or of `index_cost`
 
 TITLES = {
     "cpu_ms": "one core, ms", "bytes": "size, bytes", "sent": "requests to send", "read": "requests to read",
@@ -58,14 +57,10 @@ class AssumedMachine:
     """The machine that is assumed: nothing of it is measured."""
 
     cores: int = 16
-    hourly_price: float = 0.5
-    """Of a machine."""
-    bandwidth_gb_s: float = 1.0
-    """To the store, of a machine."""
-    latency_ms: float = 30.0
-    """Of a request."""
-    requests_per_s: float = 3500.0
-    """Uploads that the store takes under one prefix, from all machines."""
+    hourly_price: float = 0.5  # of a machine
+    bandwidth_gb_s: float = 1.0  # to the store, of a machine
+    latency_ms: float = 30.0  # of a request
+    requests_per_s: float = 3500.0  # uploads that the store takes under one prefix, from all machines
 
     @property
     def described(self) -> str:
@@ -85,8 +80,7 @@ class BillionConfig:
     publications: int = 50
     records: int = 10**9
     machines: tuple[int, ...] = (1, 10, 100, 1000)
-    batch: int = 64
-    """Contacts of the first batch, each in a shard of its own."""
+    batch: int = 64  # contacts of the first batch, each in a shard of its own
     machine: AssumedMachine = AssumedMachine()
 
 

@@ -15,7 +15,6 @@ import dataclasses
 
 import cv2
 import jax.numpy as jnp
-import matplotlib as mpl
 import numpy as np
 
 from experiments.core.charts import Panel, Rule, Series, draw
@@ -28,35 +27,26 @@ from sensors_io.scenes import appearance, objects, properties, surface
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.scenes.protocol import contact_key, make_contact
 from sensors_io.schema import MATERIALS, SENSORS, Sequence
+from sensors_io.viewer.panels import coloured
 
 VIEW_PX = 96
-ARROW = 4.0
-"""Length of an arrow over the displacement that it shows."""
+ARROW = 4.0  # length of a line over the displacement that it shows
 
 UNITS = {"hardness": "MPa", "roughness": "mm", "protrusion": "mm", "elasticity": "share", "friction": ""}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GalleryConfig:
-    """Sizes of the sheets.
+    """Sizes of the sheets."""
 
-    Args:
-      views: objects per material; the pictures of the last two show another material.
-      presses: objects that are pressed.
-      columns: frames per row of a touch.
-      varied: objects of two parts, and as many graded ones.
-      image_px: side of the sensors' pictures.
-      protocol: small enough to be planned at once, with every motion in it.
-      seed: of all objects.
-    """
-
-    views: int = 9
-    presses: int = 3
-    columns: int = 8
-    varied: int = 4
-    image_px: int = 112
+    views: int = 9  # objects per material; the pictures of the last two show another material
+    presses: int = 3  # objects that are pressed
+    columns: int = 8  # frames per row of a touch
+    varied: int = 4  # objects of two parts, and as many graded ones
+    image_px: int = 112  # side of the sensors' pictures
     protocol: SceneConfig = SceneConfig(objects=12, sequences=4 * 48, frames=24, contact_grid=48)
-    seed: int = 0
+    """Small enough to be planned at once, with every motion in it."""
+    seed: int = 0  # of all objects
 
 
 def run(config: GalleryConfig, context: Context) -> Results:
@@ -127,8 +117,7 @@ def varied(config: GalleryConfig) -> list[Picture]:
         for i in range(config.varied):
             solid = objects.sample(np.random.default_rng([config.seed, 7, i]), 0.0, 0.8, *shares)
             height = -np.asarray(surface.gap(surface.make_skin(solid, np.zeros(2), 0.0), pose, x))
-            picture = _coloured((height - height.min()) / max(float(np.ptp(height)), 1e-9))
-            rows[kind].append(mark_levels(picture, solid))
+            rows[kind].append(mark_levels(coloured(height - height.min(), float(np.ptp(height))), solid))
     caption = (
         "Relief and roughness of 24 mm, bodies flattened; the letters are the hardness (s, m, h) where a press would "
         "land."
@@ -177,25 +166,18 @@ def odds() -> Table:
     )
 
 
-def field_picture(depth_mm: np.ndarray, displacement_mm: np.ndarray, top_mm: float, px: int = 160) -> np.ndarray:
-    """Depth [h, w] in colour, brightest at `top_mm`, displacement [h, w, 2] as arrows, uint8 RGB [px, px, 3].
+def field_picture(depth_mm: np.ndarray, displacement_mm: np.ndarray, top_mm: float) -> np.ndarray:
+    """Depth [h, w] in colour, brightest at `top_mm`, displacement [h, w, 2] as lines, uint8 RGB [H, W, 3].
 
-    Arrows are four times as long as the displacement, in units of a node of 1 mm.
+    Lines are four times as long as the displacement, in units of a node of 1 mm.
     """
-    field = cv2.resize(np.clip(depth_mm / max(top_mm, 1e-9), 0, 1), (px, px), interpolation=cv2.INTER_CUBIC)
-    picture = _coloured(np.clip(field, 0, 1))
-    cell = px / depth_mm.shape[0]
+    picture = coloured(depth_mm, top_mm)
+    cell = picture.shape[0] / depth_mm.shape[0]
     for row, column in np.ndindex(*depth_mm.shape):
         start = (np.array([column, row]) + 0.5) * cell
         end = start + ARROW * cell * displacement_mm[row, column]
-        begin, tip = ((int(p[0]), int(p[1])) for p in (start, end))
-        cv2.line(picture, begin, tip, (255, 255, 255), 1, cv2.LINE_AA)
-    return picture
-
-
-def _coloured(scaled: np.ndarray) -> np.ndarray:
-    """Values 0..1 in the colours of `magma`, uint8 RGB."""
-    picture: np.ndarray = (255 * mpl.colormaps["magma"](scaled)[..., :3]).astype(np.uint8)
+        begin, tip = np.rint([start, end]).astype(int).tolist()
+        cv2.line(picture, begin, tip, (255, 255, 255), 2, cv2.LINE_AA)
     return picture
 
 

@@ -13,9 +13,6 @@ Cost: a minute on two cores.
 Expected: pictures by lamps set by eye are always distinguished from real ones and deviate by 13 grey levels; those by
 fitted optics deviate by 2, most of it noise.  Shadows explain little of the rest.  The classifier still finds the fine
 texture of a pressed real gel, which a contact grid does not resolve.
-
-Sets of pictures are RGB uint8 [P, N, N, 3]; picture p of both sets shows the same scene, so that appearance alone
-differs.
 """
 
 import dataclasses
@@ -34,41 +31,18 @@ from experiments.scenes import realism_fit
 from sensors_io.scenes import fitting, photometric
 
 PATCH_PX = 32
-BANDS = ((1, 1), (2, 2), (3, 4), (5, 7), (8, 10), (11, 13), (14, 16))
-"""Waves per patch, first and last of each band."""
+BANDS = ((1, 1), (2, 2), (3, 4), (5, 7), (8, 10), (11, 13), (14, 16))  # waves per patch, first and last of each band
 
-RIDGE = 1e-3
-"""Penalty on the squared weights of the standardised statistics of patches."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PatchClassifier:
-    """A logistic regression on statistics of patches: levels, contrast, spectrum, steps, channels' correlation, peaks.
-
-    Stronger here than a small convolutional network, which cannot learn fine texture from a few dozen pictures.
-
-    Args:
-      patches: per picture.
-    """
-
-    patches: int = 32
+RIDGE = 1e-3  # penalty on the squared weights of the standardised statistics of patches
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RealismConfig:
-    """Recordings, pictures and classifier of the comparison.
+    """Recordings, pictures and classifier of the comparison."""
 
-    Args:
-      data_dir: the recordings.
-      image_px: side of the compared pictures, to which the square middle of each recording is shrunk.
-      judge: the classifier.
-      seed: of noise and grain.
-    """
-
-    data_dir: Path | None = None
-    image_px: int = 112
-    judge: PatchClassifier = PatchClassifier()
-    seed: int = 0
+    data_dir: Path | None = None  # the recordings
+    image_px: int = 112  # side of the compared pictures, to which the square middle of each recording is shrunk
+    patches: int = 32  # of each picture, for the classifier
 
 
 def run(config: RealismConfig, context: Context) -> Results:
@@ -76,10 +50,13 @@ def run(config: RealismConfig, context: Context) -> Results:
     study = realism_fit.fit(realism_fit.read(config.data_dir, config.image_px), context)
     write_text(context.directory / "mini_optics.py", realism_fit.source(study.fitted, study.noise, study.presses))
     real = np.round(255 * study.presses.pictures[study.held_out]).astype(np.uint8)
+    pixels = np.arange(len(study.presses.axis_mm))
+    centres = [np.interp(study.touches[study.held_out, i], study.presses.axis_mm, pixels) for i in (1, 0)]
     rendered, rows = {}, {}
     for name, candidate in context.each("candidates", realism_fit.candidates(study).items()):
-        rendered[name] = realism_fit.render(study, candidate, config.seed)
-        rows[name] = compare(real, rendered[name], study, config.judge)
+        rendered[name] = realism_fit.render(study, candidate)
+        mean, error = accuracy(real, rendered[name], np.stack(centres, -1), config.patches)
+        rows[name] = {**distances(real, rendered[name]), "right": 100 * mean, "±": 100 * error}
     shadows = realism_fit.shadow_gain(study, context)
     clean, stored = (realism_fit.clean(study, optics) for optics in (study.fitted, photometric.MINI))
     drift = float(np.sqrt(np.mean((clean - stored) ** 2)))
@@ -105,17 +82,6 @@ def run(config: RealismConfig, context: Context) -> Results:
         settings={"picture": f"{config.image_px} px", "held-out presses": len(study.held_out)},
         data={"presses": len(study.touches), "ball_diameter_mm": realism_fit.DIAMETER_MM, "shadows": shadows},
     )
-
-
-def compare(
-    real: np.ndarray, made: np.ndarray, study: realism_fit.PressFit, judge: PatchClassifier
-) -> dict[str, float]:
-    """Distances, accuracy of the classifier and its standard error, both in %."""
-    axis = study.presses.axis_mm
-    x, y, _ = study.touches[study.held_out].T
-    centres = np.stack([np.interp(c, axis, np.arange(len(axis))) for c in (y, x)], -1)
-    mean, error = accuracy(real, made, centres, judge)
-    return {**distances(real, made), "right": 100 * mean, "±": 100 * error}
 
 
 def _distance_table(rows: Mapping[str, Mapping[str, float]]) -> Table:
@@ -190,8 +156,11 @@ def distances(real: np.ndarray, made: np.ndarray) -> dict[str, float]:
     }
 
 
-def accuracy(real: np.ndarray, made: np.ndarray, centres: np.ndarray, judge: PatchClassifier) -> tuple[float, float]:
+def accuracy(real: np.ndarray, made: np.ndarray, centres: np.ndarray, patches: int) -> tuple[float, float]:
     """Share of held-out patches that a classifier assigns to the right set, and its standard error over pictures.
+
+    A logistic regression on statistics of patches: levels, contrast, spectrum, steps, channels' correlation, peaks.
+    Stronger here than a small convolutional network, which cannot learn fine texture from a few dozen pictures.
 
     Two folds: trained on the patches of half of the pictures, tested on those of the other half; 0.5 means that the
     sets cannot be distinguished (Lopez-Paz & Oquab 2017, classifier two-sample test).  Patches are cut near the same
@@ -201,7 +170,7 @@ def accuracy(real: np.ndarray, made: np.ndarray, centres: np.ndarray, judge: Pat
         raise ValueError(f"real holds {len(real)} pictures: must be ≥ 4 for two folds; give more")
     order = np.random.default_rng(0).permutation(len(real))
     halves = order[: len(order) // 2], order[len(order) // 2 :]
-    seen = _statistics(_cut(np.stack([real, made]), centres, judge))
+    seen = _statistics(_cut(np.stack([real, made]), centres, patches))
     right = np.zeros(len(real))
     for train, test in (halves, halves[::-1]):
         right[test] = _train_and_test(seen[:, train], seen[:, test])
@@ -245,12 +214,12 @@ def _statistics(patches: np.ndarray) -> np.ndarray:
     return found.reshape(*patches.shape[:-3], -1)
 
 
-def _cut(sets: np.ndarray, centres: np.ndarray, judge: PatchClassifier) -> np.ndarray:
+def _cut(sets: np.ndarray, centres: np.ndarray, patches: int) -> np.ndarray:
     """Patches [2, P, K, n, n, 3] within a half patch of the centres, at the same places of both sets."""
     rng, side, size = np.random.default_rng(1), PATCH_PX, sets.shape[2]
     found = []
     for picture, centre in zip(np.moveaxis(sets, 1, 0), centres, strict=True):
-        corner = centre - side / 2 + rng.uniform(-side / 2, side / 2, (judge.patches, 2))
+        corner = centre - side / 2 + rng.uniform(-side / 2, side / 2, (patches, 2))
         corners = np.clip(np.round(corner), 0, size - side).astype(int)
         found.append([picture[:, r : r + side, c : c + side] for r, c in corners])
     return np.moveaxis(np.array(found, np.float64), 2, 0)
@@ -279,6 +248,6 @@ def _ring_power(pictures: np.ndarray) -> np.ndarray:
 
 
 DEFAULT = RealismConfig()
-SMOKE = dataclasses.replace(DEFAULT, judge=PatchClassifier(patches=8))
+SMOKE = RealismConfig(patches=8)
 
 EXPERIMENT = Experiment(name="scene_realism", config=DEFAULT, scales={"smoke": SMOKE}, run=run)

@@ -17,8 +17,7 @@ from experiments.core.context import Context
 from experiments.core.timing import interleaved
 from sensors_io.deltas import FILTERS, accumulate, choose_filter, difference
 
-Clips = Sequence[np.ndarray]
-"""Sequences of frames, uint8 [N, H, W, 3] each."""
+Clips = Sequence[np.ndarray]  # sequences of frames, uint8 [N, H, W, 3] each
 
 _SHAPE = struct.Struct("<4I16s")  # N, H, W, 3 and the name of a filter
 
@@ -33,8 +32,7 @@ class Codec:
     load: Callable[[Path], list[np.ndarray]]
 
 
-OWN, PLAIN = "chosen zstd-1", "zstd-1"
-"""Codec of the records, and that of their version 1."""
+OWN, PLAIN = "chosen zstd-1", "zstd-1"  # codec of the records, and that of their version 1
 
 Transform = tuple[Callable[[np.ndarray, str], np.ndarray], Callable[[np.ndarray, tuple[int, ...], str], np.ndarray]]
 """Clip and filter → array to store; flat values, shape of the clip and filter → clip."""

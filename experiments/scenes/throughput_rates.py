@@ -181,34 +181,11 @@ _POLL_S = 0.05  # a shard takes seconds
 _SIGKILL = -int(signal.SIGKILL)  # return code of a process that it ended
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ResumedSet:
-    """A set that was written with interruptions, compared with one that was not.
+def write_and_kill(scenes: SceneConfig, context: Context, kills: int) -> dict[str, Any]:
+    """Write the set once undisturbed and once with kills; the copies are removed after the comparison.
 
-    `records` that can be read; contacts that are missing, repeated, or damaged by their checksums; readable contacts
-    that differ in a bit or in their place.
+    Its rate, bytes a record and frames past the strain limit; the kills of the second writer, and what it `kept`.
     """
-
-    records: int
-    missing: int
-    repeated: int
-    damaged: int
-    differing: int
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class WrittenSet:
-    """The written set: rate, bytes per record, frames past the strain limit; kills of its second writer, its result."""
-
-    rate: RecordRate
-    bytes: float
-    past_limit: int
-    kills: int
-    kept: ResumedSet
-
-
-def write_and_kill(scenes: SceneConfig, context: Context, kills: int, seed: int) -> WrittenSet:
-    """Write the set once undisturbed and once with kills; the copies are removed after the comparison."""
     home = context.directory / "written"
     shutil.rmtree(home, ignore_errors=True)
     whole, killed = home / "whole", home / "killed"
@@ -219,8 +196,7 @@ def write_and_kill(scenes: SceneConfig, context: Context, kills: int, seed: int)
     for name in ("objects", "sequences", "frames", "image_px", "contact_grid"):
         command += [f"--{name.replace('_', '-')}", str(getattr(scenes, name))]
     with context.progress("killing and resuming", kills + 1) as advance:
-        shard_s = rate.seconds / shards
-        killed_times = killed_and_resumed(command, killed, kills, shards, shard_s, seed, advance)
+        killed_times = killed_and_resumed(command, killed, kills, shards, rate.seconds / shards, advance)
     with context.progress("comparing", scenes.contact_count) as advance:
         kept = compare(whole, killed, advance)
     store = RecordStore(whole)
@@ -228,7 +204,7 @@ def write_and_kill(scenes: SceneConfig, context: Context, kills: int, seed: int)
     flags = [s.flags for i in rows for s in store.contact(i, fields=False).values()]
     past = int((np.concatenate(flags) & np.uint32(Flag.STRAIN_LIMIT) > 0).sum())
     shutil.rmtree(home)
-    return WrittenSet(rate=rate, bytes=size, past_limit=past, kills=killed_times, kept=kept)
+    return {"rate": rate, "bytes": size, "past_limit": past, "kills": killed_times, "kept": kept}
 
 
 def killed_and_resumed(
@@ -237,7 +213,6 @@ def killed_and_resumed(
     kills: int,
     shards: int,
     shard_s: float,
-    seed: int,
     advance: Callable[[], object] = lambda: None,
 ) -> int:
     """Run the command that writes records, kill it with SIGKILL at random moments, let the last run finish.
@@ -251,8 +226,7 @@ def killed_and_resumed(
     """
     require(kills < shards, "kills", kills, f"must be < {shards}, the shards of the set, or more contacts be written")
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(out.parent / "compiled")}
-    rng = np.random.default_rng(seed)
-    killed = 0
+    rng, killed = np.random.default_rng(0), 0
     for shard in np.sort(rng.choice(shards - 1, kills, replace=False)):
         process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
@@ -268,8 +242,11 @@ def killed_and_resumed(
     return killed
 
 
-def compare(whole: Path, killed: Path, advance: Callable[[], None] = lambda: None) -> ResumedSet:
-    """Read every entry of both sets; `advance` is called before each."""
+def compare(whole: Path, killed: Path, advance: Callable[[], None] = lambda: None) -> dict[str, int]:
+    """Records of the killed writer's set that can be read, and contacts that are not as in the whole one.
+
+    They are missing, repeated, damaged by their checksums, or differ in a bit or in their place.
+    """
     left, right = RecordStore(whole), RecordStore(killed)
     records = damaged = differing = 0
     for i, key in enumerate(right.contacts):
@@ -281,13 +258,13 @@ def compare(whole: Path, killed: Path, advance: Callable[[], None] = lambda: Non
             continue
         records += sum(len(sequence) for sequence in contact.values())
         differing += i >= len(left) or key != left.contacts[i] or not _same(contact, left.contact(i))
-    return ResumedSet(
-        records=records,
-        missing=len(set(left.contacts) - set(right.contacts)),
-        repeated=len(right) - len(set(right.contacts)),
-        damaged=damaged,
-        differing=differing,
-    )
+    return {
+        "records": records,
+        "missing": len(set(left.contacts) - set(right.contacts)),
+        "repeated": len(right) - len(set(right.contacts)),
+        "damaged": damaged,
+        "differing": differing,
+    }
 
 
 def _same(a: Mapping[str, Sequence], b: Mapping[str, Sequence]) -> bool:

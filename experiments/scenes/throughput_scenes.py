@@ -3,11 +3,10 @@
     python -m experiments throughput_scenes
     python -m experiments throughput_scenes --scale full      (feeds all 1.32 million records: about twenty minutes)
 
-Measures records a second, one record being one frame of one sensor with its picture and fields: as a feed without
-disk, at 112² and 448², over the protocol's mix of presses and motions; and as a written set, which is then made again
-by a process that is killed five times at random moments, and compared entry by entry, bit for bit.  Clock rates depend
-on other load on the machine, processor times hardly.  Reports the time of each part of a record, the machine's lower
-bound, the frames that the protocol left out, and the accuracy of labels predicted from force alone.
+A record is one frame of one sensor with its picture and fields.  They are fed without disk, at 112² and 448², and
+written; the set is made again by a process that is killed five times at random moments, and compared bit for bit.
+Clock rates depend on other load on the machine, processor times hardly.  The report also has the time of each part of a
+record, the machine's lower bound, the frames left out, and labels predicted from force alone.
 
 Cost: about four minutes on two cores; `--scale smoke` a minute and a half on one.
 
@@ -16,17 +15,16 @@ Expected: some 800 records a second at 112², so that the paper's 1.32 million r
 
 import dataclasses
 import itertools
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
-from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context
-from experiments.core.results import Cell, Picture, Requirement, Results, Table, at_least, at_most, named_table
+from experiments.core.results import Cell, Requirement, Results, Table, at_least, at_most, named_table
 from experiments.core.runner import Experiment
 from experiments.scenes import throughput_rates
-from experiments.scenes.throughput_rates import RecordRate, ResumedSet, WrittenSet
+from experiments.scenes.throughput_rates import RecordRate
 from sensors_io.scenes import schedule
 from sensors_io.scenes.cards import object_cards
 from sensors_io.scenes.config import SceneConfig, stream
@@ -40,48 +38,29 @@ PAPER_RECORDS = PAPER_SEQUENCES * PAPER_FRAMES
 FEED_RATE, LARGE_RATE, WRITTEN_HOURS = 400, 150, 1.5
 """Requirements: records a second as a feed of ordinary and of large pictures; hours to write the paper's set."""
 
-KILLS, KILLED_RECORDS = 5, 20_000
-"""Requirements on the killed writer: kills, records."""
+KILLS, KILLED_RECORDS = 5, 20_000  # requirements on the killed writer: kills, records
 
 ORDINAL = ("hardness", "roughness", "protrusion")
 
-Parts = Mapping[str, Mapping[str, float]]
-"""Sensor → part of the work → milliseconds of one core a record."""
+Parts = Mapping[str, Mapping[str, float]]  # sensor → part of the work → milliseconds of one core a record
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ThroughputConfig:
-    """Sizes of the measurements.
+    """Sizes of the measurements."""
 
-    Args:
-      image_px: side of the ordinary pictures.
-      large_px: side of the large ones.
-      frames: of a sequence.
-      contact_grid: of the contact solver.
-      feed_contacts: fed at `image_px`; a contact is 360 records.
-      large_contacts: fed at `large_px`.
-      written_contacts: written, and written again under kills.
-      kills: of the second writer, at random moments; it must write more shards than that.
-      stage_objects: over which the parts are timed, per sensor.
-      stage_sensors: whose parts are timed.
-      leak_objects: whose labels are predicted from force alone.
-      threads: that generate.
-      seed: of the moments of the kills.
-    """
-
-    image_px: int = 112
-    large_px: int = 448
-    frames: int = PAPER_FRAMES
-    contact_grid: int = 64
-    feed_contacts: int = 56
-    large_contacts: int = 8
-    written_contacts: int = 56
-    kills: int = 5
-    stage_objects: int = 2
-    stage_sensors: tuple[str, ...] = SENSORS
-    leak_objects: int = PAPER_OBJECTS
-    threads: int = 2
-    seed: int = 0
+    image_px: int = 112  # side of the ordinary pictures
+    large_px: int = 448  # side of the large ones
+    frames: int = PAPER_FRAMES  # of a sequence
+    contact_grid: int = 64  # of the contact solver
+    feed_contacts: int = 56  # fed at `image_px`; a contact is 360 records
+    large_contacts: int = 8  # fed at `large_px`
+    written_contacts: int = 56  # written, and written again under kills
+    kills: int = 5  # of the second writer, at random moments; it must write more shards than that
+    stage_objects: int = 2  # over which the parts are timed, per sensor
+    stage_sensors: tuple[str, ...] = SENSORS  # whose parts are timed
+    leak_objects: int = PAPER_OBJECTS  # whose labels are predicted from force alone
+    threads: int = 2  # that generate
 
     def scenes(self, contacts: int, image_px: int) -> SceneConfig:
         """The protocol over so many contacts, with the paper's share of presses."""
@@ -95,30 +74,19 @@ class ThroughputConfig:
         )
 
 
-class NamedRate(NamedTuple):
-    """A measured and a required rate, records per second; bytes per record of a written set."""
-
-    name: str
-    rate: RecordRate
-    required: float
-    bytes: float | None = None
-
-
 def run(config: ThroughputConfig, context: Context) -> Results:
     """Feed, write, kill, time the parts; what was measured before an interruption is not measured again."""
     feed = _feed(config, context, "feed/0", config.feed_contacts, config.image_px)
     large = _feed(config, context, "large/0", config.large_contacts, config.large_px)
     to_write = config.scenes(config.written_contacts, config.image_px)
-    write = lambda: throughput_rates.write_and_kill(to_write, context, config.kills, config.seed)
-    found = context.once("written/0", write)
-    kept = ResumedSet(**found["kept"])
-    written = WrittenSet(**found | {"rate": RecordRate(**found["rate"]), "kept": kept})
+    write = lambda: throughput_rates.write_and_kill(to_write, context, config.kills)
+    written = context.once("written/0", write)
+    rate = RecordRate(**written["rate"])
     scenes = config.scenes(config.feed_contacts, config.image_px)
     parts = {
         name: throughput_rates.part_costs(scenes, SENSORS.index(name), config.stage_objects)
         for name in context.each("timing parts", config.stage_sensors, still=True)
     }
-    floor = _floor_table(config)
     paper = SceneConfig(
         objects=config.leak_objects,
         sequences=len(SENSORS) * round(config.leak_objects * PAPER_SEQUENCES / len(SENSORS) / PAPER_OBJECTS),
@@ -126,24 +94,24 @@ def run(config: ThroughputConfig, context: Context) -> Results:
     with context.progress("planning the paper's set", 1) as advance:
         leaks = force_leaks(paper)
         advance()
-    rates = (
-        NamedRate(f"feed {config.image_px}²", feed, FEED_RATE),
-        NamedRate(f"feed {config.large_px}²", large, LARGE_RATE),
-        NamedRate(f"written {config.image_px}²", written.rate, PAPER_RECORDS / WRITTEN_HOURS / 3600, written.bytes),
-    )
-    lost = kept.missing + kept.repeated + kept.damaged + kept.differing
+    lost = sum(n for name, n in written["kept"].items() if name != "records")
     return Results(
         verdict=(
             f"A feed makes {feed.per_second:.0f} records/s ({feed.cpu_ms:.2f} ms of one core each), "
             f"{large.per_second:.0f} with the large pictures.",
-            f"{lost} contacts are missing, repeated, damaged or different after {written.kills} kills of their writer.",
+            f"{lost} contacts are missing, repeated, damaged or different after {written['kills']} kills.",
         ),
-        requirements=_requirements(feed, large, written, max(leaks[-1][name] for name in ORDINAL)),
-        tables=(_rate_table(rates), _part_table(config, parts), floor, left_out_table(paper), _leak_table(leaks)),
-        pictures=(_picture(config, rates, parts),),
+        requirements=_requirements(feed, large, rate, written, max(leaks[-1][name] for name in ORDINAL)),
+        tables=(
+            _rate_table(config, feed, large, rate, written["bytes"]),
+            _part_table(config, parts),
+            _floor_table(config),
+            left_out_table(paper),
+            _leak_table(leaks),
+        ),
         settings={"threads": config.threads, "frames": config.frames, "contact_grid": config.contact_grid},
-        data={"feed_records": feed.records, "large_records": large.records, "written_records": written.rate.records},
-        timing={"feeding": feed.seconds, "feeding large": large.seconds, "writing": written.rate.seconds},
+        data={"feed_records": feed.records, "large_records": large.records, "written_records": rate.records},
+        timing={"feeding": feed.seconds, "feeding large": large.seconds, "writing": rate.seconds},
     )
 
 
@@ -227,48 +195,54 @@ def left_out_table(config: SceneConfig) -> Table:
 # Report --------------------------------------------------------------------------------------------------------------
 
 
-def _requirements(feed: RecordRate, large: RecordRate, written: WrittenSet, leak: float) -> tuple[Requirement, ...]:
-    hours, write_hours = (PAPER_RECORDS / r.per_second / 3600 for r in (feed, written.rate))
+def _requirements(
+    feed: RecordRate, large: RecordRate, rate: RecordRate, written: Mapping[str, Any], leak: float
+) -> tuple[Requirement, ...]:
+    hours, write_hours = (PAPER_RECORDS / r.per_second / 3600 for r in (feed, rate))
+    kept = written["kept"]
     return (
         at_least("feed at 112²", feed.per_second, FEED_RATE, "records/s"),
         at_least("feed at 448²", large.per_second, LARGE_RATE, "records/s"),
         at_most("paper-sized set as a feed", hours, 1, "h"),
         at_most("paper-sized set written", write_hours, WRITTEN_HOURS, "h"),
-        at_most("paper-sized set on disk", PAPER_RECORDS * written.bytes / 1e9, 60, "GB"),
-        at_least("kills at random moments", written.kills, KILLS),
-        at_least("records written over the kills", written.kept.records, KILLED_RECORDS),
-        at_most("contacts missing after the kills", written.kept.missing, 0),
-        at_most("contacts there twice", written.kept.repeated, 0),
-        at_most("contacts damaged, by their checksums", written.kept.damaged, 0),
-        at_most("contacts unlike an undisturbed writer's", written.kept.differing, 0),
-        at_most("written frames past the strain limit", written.past_limit, 0),
+        at_most("paper-sized set on disk", PAPER_RECORDS * written["bytes"] / 1e9, 60, "GB"),
+        at_least("kills at random moments", written["kills"], KILLS),
+        at_least("records written over the kills", kept["records"], KILLED_RECORDS),
+        at_most("contacts missing after the kills", kept["missing"], 0),
+        at_most("contacts there twice", kept["repeated"], 0),
+        at_most("contacts damaged, by their checksums", kept["damaged"], 0),
+        at_most("contacts unlike an undisturbed writer's", kept["differing"], 0),
+        at_most("written frames past the strain limit", written["past_limit"], 0),
         at_most("ordinal labels from force alone", leak, 40, "% (chance 33)"),
     )
 
 
-def _rate_table(rates: Sequence[NamedRate]) -> Table:
+def _rate_table(
+    config: ThroughputConfig, feed: RecordRate, large: RecordRate, written: RecordRate, written_bytes: float
+) -> Table:
+    rates = (
+        (f"feed {config.image_px}²", feed, None),
+        (f"feed {config.large_px}²", large, None),
+        (f"written {config.image_px}²", written, written_bytes),
+    )
     return named_table(
         "Rates",
         [
             {
-                "how": r.name,
-                "records": r.rate.records,
-                "by the clock": r.rate.per_second,
-                "one core": r.rate.cpu_ms,
-                "two idle cores": 2000 / r.rate.cpu_ms,
-                "1.32 million": PAPER_RECORDS / r.rate.per_second / 3600,
-                "size": r.bytes,
+                "how": name,
+                "records": rate.records,
+                "by the clock": rate.per_second,
+                "one core": rate.cpu_ms,
+                "two idle cores": 2000 / rate.cpu_ms,
+                "1.32 million": PAPER_RECORDS / rate.per_second / 3600,
+                "size": size,
             }
-            for r in rates
+            for name, rate, size in rates
         ],
-        formats={
-            **dict.fromkeys(("by the clock", "two idle cores", "size"), ".0f"),
-            **{"records": "d", "one core": ".2f", "1.32 million": ".2f"},
-        },
-        units={
-            **dict.fromkeys(("by the clock", "two idle cores"), "records/s"),
-            **{"one core": "ms/record", "1.32 million": "h", "size": "bytes/record"},
-        },
+        formats=dict.fromkeys(("by the clock", "two idle cores", "size"), ".0f")
+        | {"records": "d", "one core": ".2f", "1.32 million": ".2f"},
+        units=dict.fromkeys(("by the clock", "two idle cores"), "records/s")
+        | {"one core": "ms/record", "1.32 million": "h", "size": "bytes/record"},
         meanings={"two idle cores": "2 s over the time of one core"},
         note="The start, a minute of compiling and looking at objects, is left out.",
     )
@@ -311,24 +285,6 @@ def _leak_table(leaks: list[dict[str, Any]]) -> Table:
         units={**dict.fromkeys((*ORDINAL, reach), "%"), "median peak": "N"},
         note="Balanced accuracy of the likeliest level given the force; chance is 33 %.  Rejecting flagged frames is "
         "the same as dropping them.",
-    )
-
-
-def _picture(config: ThroughputConfig, rates: Sequence[NamedRate], parts: Parts) -> Picture:
-    measured = Series(x=[r.rate.per_second for r in rates], bar=True)
-    marks = Series("required", x=[r.required for r in rates], line="", marker="|", size=300, colour="black")
-    names = list(next(iter(parts.values())))
-    stacked = [Series(part, x=[max(costs[part], 0.0) for costs in parts.values()], bar=True) for part in names]
-    panels = [
-        Panel([measured, marks], rows=[r.name for r in rates], x_label="records/s by the clock", written=".0f"),
-        Panel(stacked, rows=list(parts), stacked=True, x_label="ms of one core a record"),
-    ]
-    return Picture(
-        name="throughput",
-        title="Rates, and time by part",
-        caption=f"Records a second on {config.threads} threads; the work on a record with a picture of "
-        f"{config.image_px}², friction where the object moves.",
-        content=draw(panels, size=(8.6, 1.1 + 0.34 * max(len(rates), len(parts) + 1))),
     )
 
 

@@ -1,4 +1,3 @@
 """Three small trainings to be disturbed: a loop of three numbers, GRPO alone, a whole study."""
 
-PACKAGE = __name__
-"""The package in which the command line finds them: `main(["counting"], package=PACKAGE)`."""
+PACKAGE = __name__  # the package in which the command line finds them: `main(["counting"], package=PACKAGE)`

@@ -9,7 +9,6 @@ can be killed hundreds of times.
 """
 
 import dataclasses
-import io
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import traverse_util
 
-from experiments.core.artifacts import write_bytes
+from experiments.core.artifacts import write_arrays
 from experiments.core.context import Context
 from experiments.core.loops import run_loop
 from experiments.core.results import Results
@@ -26,6 +25,7 @@ from experiments.core.runner import Experiment
 from experiments.faults.trainings.small_study import ARM, MODEL
 from experiments.study.alarm_log import alarm_log
 from experiments.study.scores import PUBLISHED
+from sensors_io.arrays import load_arrays
 from sensors_io.schema import SENSORS
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.touch_policy import TouchPolicy, build_policy, touch_shapes
@@ -121,11 +121,8 @@ def fresh_decoder(policy: TouchPolicy, path: Path) -> Params:
     if not path.exists():
         shapes = touch_shapes(MODEL, MODEL.vision.image_px, SENSORS)
         params = policy.init(0, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes))
-        buffer, arrays = io.BytesIO(), dict[str, Any](traverse_util.flatten_dict(params["decoder"], sep="/"))
-        np.savez(buffer, **arrays)
-        write_bytes(path, buffer.getvalue())
-    with np.load(path) as file:
-        return jax.tree.map(jnp.asarray, traverse_util.unflatten_dict(dict(file), sep="/"))
+        write_arrays(path, traverse_util.flatten_dict(params["decoder"], sep="/"))
+    return jax.tree.map(jnp.asarray, traverse_util.unflatten_dict(load_arrays(path), sep="/"))
 
 
 EXPERIMENT = Experiment(name="small_grpo", config=ReinforcingConfig(), run=run)

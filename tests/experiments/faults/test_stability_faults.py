@@ -11,7 +11,7 @@ from experiments.faults.damaged_files import OLDER, OUTCOMES, SAME, WRONG, Damag
 from experiments.faults.fixtures import unfinished_run
 from experiments.faults.flipped_bits import FOUND, RAW, Flip
 from experiments.faults.kills import START, STEPPING, Kill
-from experiments.faults.stability_faults import GRPO, KilledRuns, WaitingConfig, damage_table, kill_table, requirements
+from experiments.faults.stability_faults import GRPO, KilledRuns, WaitingConfig, damage_table, kill_table, report
 from sensors_io.index import TABLES
 from tests.experiments import tiny
 from tests.experiments.encoder.test_pretrain import PRETRAIN
@@ -27,8 +27,8 @@ ANSWERED = [{"input": f"{i}", "kind": "run", "exit code": 1, "answer": "Error", 
 
 def unmet(killed=KILLED, damage=(DAMAGE,), inputs=ANSWERED, flips=(FLIP,)):
     """Names of the requirements that are not met, where 0.1 s of 10 s are waited."""
-    found = requirements({GRPO: killed}, list(damage), list(flips), list(inputs), {"sft/0": (10.0, 0.1)})
-    return {r.name for r in found if not r.met}
+    found = report({GRPO: killed}, list(damage), list(flips), list(inputs), {"sft/0": (10.0, 0.1)})
+    return {r.name for r in found.requirements if not r.met}
 
 
 def test_all_is_met_where_nothing_differs():

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from experiments.core.results import assemble
 from experiments.fields.known_motion import NOISE_GREY, GelCamera, MarkerGel, gels, pressed
 from experiments.fields.marker_drift import bound_px, drift_section
-from experiments.fields.sections import assemble
 
 
 def test_known_motion_is_exact():

@@ -2,7 +2,7 @@
 
 import pytest
 
-from experiments.fields.sections import assemble
+from experiments.core.results import assemble
 from experiments.fields.stress import StressedField, StressOutcome, break_table, gathered, stress_section
 from sensors_io.schema import Flag
 

@@ -11,9 +11,9 @@ def test_arrows_point_along_the_displacement() -> None:
     still = np.zeros((4, 4))
     moved = np.zeros((4, 4, 2))
     moved[2, 1] = (0.5, 0.0)  # two cells to the right
-    picture = scene_gallery.field_picture(still, moved, 1.0, px=80)
-    assert picture[50, 40:68].min() > 200
-    assert picture[50, 75].max() < 60
+    picture = scene_gallery.field_picture(still, moved, 1.0)  # 80 px a node
+    assert picture[200, 130:270].min() > 200
+    assert picture[200, 300].max() < 100
 
 
 def test_letters_of_a_uniform_object_are_all_the_same() -> None:

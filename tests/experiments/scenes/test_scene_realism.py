@@ -11,7 +11,7 @@ from experiments.core.artifacts import read_json
 from experiments.core.context import Context
 from experiments.core.errors import ResultsError
 from experiments.scenes import realism_fit, scene_realism
-from experiments.scenes.scene_realism import PatchClassifier, accuracy, distances
+from experiments.scenes.scene_realism import accuracy, distances
 from sensors_io.scenes import fitting, photometric
 from sensors_io.scenes.photometric import MINI
 from sensors_io.scenes.sensors import GELSIGHT_MINI
@@ -47,9 +47,7 @@ def _write(path: Path, square: np.ndarray, rng: np.random.Generator) -> None:
 
 @pytest.mark.slow
 def test_the_fit_finds_the_optics_that_made_the_pictures(recordings: Path, tmp_path: Path) -> None:
-    config = dataclasses.replace(
-        scene_realism.SMOKE, data_dir=recordings, image_px=64, judge=PatchClassifier(patches=4)
-    )
+    config = dataclasses.replace(scene_realism.SMOKE, data_dir=recordings, image_px=64, patches=4)
     directory = run_shrunk(scene_realism, config, tmp_path)
     results = read_json(directory / "results.json")
     (stored,) = results["requirements"]
@@ -104,10 +102,10 @@ def test_twice_the_contrast_is_six_decibels() -> None:
 
 
 def test_the_classifier_is_at_chance_where_nothing_differs() -> None:
-    mean, error = accuracy(pictures(0), pictures(1), CENTRES, PatchClassifier(patches=16))
+    mean, error = accuracy(pictures(0), pictures(1), CENTRES, patches=16)
     assert mean == pytest.approx(0.5, abs=4 * error + 0.02)
 
 
 def test_the_classifier_finds_a_fifth_more_noise() -> None:
-    mean, _ = accuracy(pictures(0), pictures(1, 3.6), CENTRES, PatchClassifier(patches=16))
+    mean, _ = accuracy(pictures(0), pictures(1, 3.6), CENTRES, patches=16)
     assert mean > 0.9
