@@ -29,11 +29,17 @@ def concurrently(
     """The results of independent work on each item, in the order of the items, under a progress bar.
 
     The steps of small policies use a part of the cores: two seeds on two cores train 1.6 times as fast at the same time
-    as one after the other.  Results and log are the same to the bit.  A signal ends each item's work after its step;
-    the first error of an item is raised once the others have ended after theirs.
+    as one after the other.  Results and log are the same to the bit.  A signal ends each item's work after its step.
 
-    Besides the run and the cache, `work` reads and writes only what no other item does.  So many items are computed
-    `at_once`, each in a thread; by default `idle_cores`.
+    Args:
+      context: the run.
+      title: of the bar.
+      items: of the work.
+      work: reads and writes only what no other item does, besides the run and the cache.
+      at_once: number of items at the same time, each in a thread; by default `idle_cores`.
+
+    Raises:
+      Exception: the first of an item, once the others have ended after the step at hand.
     """
     threads = min(idle_cores(context) if at_once is None else at_once, len(items))
     if threads <= 1:

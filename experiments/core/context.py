@@ -97,11 +97,17 @@ class MetricLog:
 
 
 class Context:
-    """Everything through which an experiment acts on its run, in `directory`, `runs/NAME/STAMP`.
+    """Everything through which an experiment acts on its run.
 
-    Every entry of `cache_dir`, which runs share, must be named by the hash of its inputs.  Watchers are called with
-    every logged line and every loop; `stopping` receives signals, by default none; the first of the processes alone
-    writes; `devices` are those of the training steps; units of work run where the launcher says.
+    Args:
+      directory: `runs/NAME/STAMP`.
+      cache_dir: data shared between runs; every entry must be named by the hash of its inputs.
+      console: for people.
+      watchers: called with every logged line and every loop.
+      stopping: receives the signals that ask the run to stop; the default receives none.
+      processes: of which the first alone writes.
+      devices: of the training steps.
+      launcher: where units of work run.
     """
 
     def __init__(

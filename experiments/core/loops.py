@@ -37,10 +37,15 @@ def stage_hooks(
     scored: bool = False,
     describe: Callable[[Any], TrainingSample] | None = None,
 ) -> Iterator[Hooks]:
-    """Hooks that make a training stage, `PHASE/SEED` or `PHASE/ARM/SEED`, part of a run; inside the block it is timed.
+    """Hooks that make a training stage part of a run; inside the block the stage is timed.
 
-    By default metrics are logged unchanged.  Where it is `scored`, the checkpoint of the highest held-out score is kept
-    too.  With `describe`, which gives what people see of it, a step returns a sample.
+    Args:
+      context: the run.
+      stage: its name, `PHASE/SEED` or `PHASE/ARM/SEED`.
+      steps: of the whole stage, for the progress bar.
+      make_log: by default the metrics are logged unchanged.
+      scored: keep the checkpoint of the highest held-out score too.
+      describe: of the sample that a step returns, what people see; without it no step returns one.
     """
     times, logs, left_out = LoopTime(), list[Log](), [0.0]
     folder = context.checkpoint_dir(stage)

@@ -35,10 +35,15 @@ def heatmaps(
     mark: float | None = None,
     size: tuple[float, float] | None = None,
 ) -> bytes:
-    """Draw matrices side by side, at most so many columns, on one scale of colours, as SVG.
+    """Draw matrices side by side on one scale of colours, as SVG.
 
-    The limits are the values of the first and the last colour.  With a label a `colour_bar` explains the colours, and
-    `mark` is a value to mark on it.  The size is in inches.
+    Args:
+      maps: one at least, with common labels of their axes.
+      columns: of matrices, at most.
+      limits: values of the first and the last colour; values outside take these.
+      logarithmic: whether equal ratios are equal steps of colour.
+      colour_map, size: matplotlib's colour map, inches.
+      colour_bar, mark: label of a bar that explains the colours, and a value to mark on it; no bar by default.
     """
     import matplotlib as mpl
     from matplotlib.cm import ScalarMappable
@@ -78,9 +83,12 @@ def heatmaps(
 def image_grid(
     rows: Mapping[str, Sequence[np.ndarray] | np.ndarray], columns: Sequence[str] = (), *, cell_inch: float = 1.25
 ) -> bytes:
-    """Draw a grid of pictures, the names of rows to the left and those of columns, if any, above, as PNG.
+    """Draw a grid of pictures, the names of rows to the left and those of columns above, as PNG.
 
-    Pictures are [H, W, 3], RGB, uint8 or float in [0, 1], with sides of `cell_inch`; a shorter row leaves cells empty.
+    Args:
+      rows: name → pictures [H, W, 3], RGB, uint8 or float in [0, 1]; a shorter row leaves cells empty.
+      columns: a name per column, or none.
+      cell_inch: side of a picture.
     """
     from matplotlib.figure import Figure
 

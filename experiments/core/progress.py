@@ -32,10 +32,15 @@ def in_megabytes(callback: ProgressCallback) -> ProgressCallback:
 
 
 class Loop:
-    """The progress of a loop of `total` steps; those that earlier sessions `completed` do not count into the rate.
+    """The progress of a loop.
 
-    A `still` bar is redrawn with each step only, not ten times a second, which would take time from what is timed.  A
-    note, such as "compiling", is shown until the first step.  The clock counts seconds.
+    Args:
+      title: of its bar.
+      total: steps of the whole loop.
+      completed: steps of earlier sessions; they do not count into the rate.
+      still: redraw with each step only, not ten times a second, which would take time from what is timed.
+      note: shown beside the bar until the first of its steps, such as "compiling".
+      clock: seconds.
     """
 
     def __init__(

@@ -24,9 +24,15 @@ _LOG = logging.getLogger(__name__)
 
 
 def run_at(url: str, name: str, execute: Callable[[Path], int]) -> int:
-    """Compute a run of an experiment in a folder that is copied to `url`/`name`; the exit code, which `execute` gives.
+    """Compute a run of an experiment in a folder that is copied to `url`/`name`; the exit code.
 
-    `StoreError` before anything is computed, if the store cannot be read.
+    Args:
+      url: of all runs.
+      name: of the experiment.
+      execute: runs or continues in a folder of runs; returns the exit code.
+
+    Raises:
+      StoreError: before anything is computed, if the store cannot be read.
     """
     runs_dir = Path(tempfile.mkdtemp(prefix="touchr1-runs-"))
     copier, ended = _Copier(Mirror(f"{url}/{name}"), runs_dir / name), threading.Event()

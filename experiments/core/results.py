@@ -84,10 +84,15 @@ def named_table(
     meanings: Mapping[str, str] = {},
     note: str = "",
 ) -> Table:
-    """A table from rows that name their cells, in the order in which they first do; a missing cell is `None`.
+    """A table from rows that name their cells; the first column names the row.
 
-    `formats` (".3g" by default), `units` and `meanings` are by column; `ResultsError` for one that no row names.  The
-    note is a sentence above the table.
+    Args:
+      title, note: heading, and a sentence above the table.
+      rows: column → cell; columns are in the order in which rows first name them; a missing cell is `None`.
+      formats, units, meanings: column → format of its numbers (".3g" by default), unit, explanation.
+
+    Raises:
+      ResultsError: a format, unit or meaning of a column that no row names.
     """
     names = list(dict.fromkeys(name for row in rows for name in row))
     for field, given in (("formats", formats), ("units", units), ("meanings", meanings)):

@@ -204,8 +204,11 @@ def parse(experiment: Experiment[Any], arguments: Sequence[str], about: str) -> 
     """Resolve the command line: the runner's options and the overridden `.config`.
 
     The scale is picked out first, since it chooses the defaults that everything else overrides, and choices such as
-    `grpo.algorithm:dapo` are, since their options may stand anywhere; tyro refuses unknown ones.  `SystemExit` with
-    code 2 after the correction of a typo, 0 after help; `ValueError` for a number that a class or all scales refuse.
+    `grpo.algorithm:dapo` are, since their options may stand anywhere; tyro refuses unknown ones.
+
+    Raises:
+      SystemExit: code 2 after the correction of a typo, 0 after help.
+      ValueError: a number that no scale has; what a class refuses itself.
     """
     arguments = sorted(arguments, key=lambda word: not _chooses(word, experiment.config))
     configs, scale = experiment.configs(), "default"

@@ -8,8 +8,14 @@ from typing import Any
 def require_sizes(config: Any, scales: Collection[Any]) -> None:
     """Refuse what no scale has: numbers below 0 where none is, and no steps, seeds or rounds where all have some.
 
-    What a class checks by itself is left to it, and a seed may be 0.  `ValueError` names the field, its value and the
-    bound.
+    What a class checks by itself is left to it, and a seed may be 0.
+
+    Args:
+      config: of a command.
+      scales: configurations of the experiment, of the same class.
+
+    Raises:
+      ValueError: naming the field, its value and the bound.
     """
     usual = [_leaves(scale) for scale in scales]
     for path, (value, owner) in _leaves(config).items():

@@ -63,8 +63,13 @@ class Stopping:
         """Delay the stop: the block polls the function that it gets, and leaves when that returns True.
 
         Blocks of several threads may be open at a time; the main thread's must be the first and the last of them.
-        `agreed` tells whether a signal came to any process of the run; all processes call it equally often, so that all
-        leave after the same step.  `Stopped` is raised at the end if one came, or `leave` was called.
+
+        Args:
+          agreed: from "a signal came to this process" to "one came to any process of the run"; all processes call it
+            equally often, so that all leave after the same step.
+
+        Raises:
+          Stopped: when the block ends, if a signal came to any process, or `leave` was called.
         """
         stop = False
 

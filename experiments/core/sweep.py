@@ -148,9 +148,14 @@ def plan(
 ) -> tuple[Path, tuple[SweepUnit, ...]]:
     """The folder of a sweep and its units, in the order of the values, the last option fastest.
 
-    By default the folder is named after the units, so that the same sweep goes on in it.  `rest` are words for all
-    runs.  `SweepError` as `options_of`, for an option that a sweep gives itself, or two units of one configuration;
-    `SystemExit` with code 2 after the correction of an option or a value that the experiment does not know.
+    Args:
+      vary: options and their values, as `options_of` takes them.
+      rest: words of the command line for all runs.
+      into: the folder; by default named after the units, so that the same sweep goes on in it.
+
+    Raises:
+      SweepError: as `options_of`; an option that a sweep gives itself, or two units of one configuration.
+      SystemExit: code 2 after the correction of an option or a value that the experiment does not know.
     """
     varied, planned = options_of(vary), dict[str, tuple[dict[str, str], tuple[str, ...], Any]]()
     words = (*rest, *(f"--{option}" for option in varied))

@@ -62,7 +62,11 @@ class Latest(Watcher):
 class LivePage(Watcher):
     """Writes `report.html` during a run, until the report replaces it; no server, no script.
 
-    `curves` are phase → scalars to draw, `usual_s` the duration of the last run of the same configuration, if any.
+    Args:
+      directory, about, description: of the run, as `write_report` takes them.
+      curves: phase → scalars to draw.
+      usual_s: duration of the last run of the same configuration; `None` if there was none.
+      clock: seconds.
     """
 
     def __init__(
