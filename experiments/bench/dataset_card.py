@@ -17,11 +17,14 @@ about half of the questions right, those about material least often.
 
 import collections
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 
 from experiments.bench.contacts import read_source
+from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context
-from experiments.core.results import Cell, Results, Table, at_least, at_most, named_table
+from experiments.core.look import PALETTE, SHARED
+from experiments.core.results import Cell, Picture, Results, Table, at_least, at_most, named_table
 from experiments.core.runner import Experiment
 from experiments.study.sources import SourceConfig, prepare_records
 from sensors_io.records import RecordStore
@@ -83,6 +86,14 @@ def run(config: DatasetCardConfig, context: Context) -> Results:
             _threshold_table(source),
             _object_table(source),
             _sample_table(items),
+        ),
+        pictures=(
+            Picture(
+                name="answers",
+                title="Answers",
+                caption="Each bar is a kind and an attribute; colours are levels in their order, from the left.",
+                content=_answer_chart(card.shares(items)),
+            ),
         ),
         data={
             "test_objects": len(source.bench.objects()),
@@ -185,6 +196,23 @@ def _sample_table(items: Sequence[Item]) -> Table:
     samples = ((kind, first[kind]) for kind in KINDS if kind in first)
     rows = [{"kind": kind, "question": item.question, "rationale": item.rationale} for kind, item in samples]
     return named_table("One of each", rows)
+
+
+def _answer_chart(shares: Sequence[card.AnswerShare]) -> bytes:
+    """Share of every answer of every kind and attribute as stacked bars, with marks where equal shares would end."""
+    parts = [[100 * count / sum(share.counts) for count in share.counts] for share in shares]
+    levels = list(itertools.zip_longest(*parts, fillvalue=0.0))
+    bars = [Series(x=x, bar=True, alpha=0.75, colour=PALETTE[k % len(PALETTE)]) for k, x in enumerate(levels)]
+    ends = [(100 * k / len(s.counts), row) for row, s in enumerate(shares) for k in range(1, len(s.counts))]
+    x, y = zip(*ends, strict=True)
+    panel = Panel(
+        [*bars, Series(x=x, y=y, marker="$|$", size=90.0, colour=SHARED)],
+        rows=[f"{share.kind}, {share.attribute}" for share in shares],
+        x_label="share of the answers, %; marks: equal shares",
+        x_limits=(0, 100),
+        stacked=True,
+    )
+    return draw([panel])
 
 
 DEFAULT = DatasetCardConfig()

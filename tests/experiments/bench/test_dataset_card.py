@@ -32,6 +32,7 @@ def test_everything_is_reported(directory):
     assert {row[0]: row[2] for row in results["tables"][0]["rows"]} == {
         kind: count for kind, count in dataclasses.asdict(QUOTA).items() if count
     }
+    assert (directory / "plots" / "answers.svg").exists()
 
 
 def test_its_items_are_of_test_objects_alone(directory, records):
