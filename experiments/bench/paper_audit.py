@@ -14,9 +14,13 @@ So results here are compared with the directions of the paper, never with its va
 
 import dataclasses
 
+import numpy as np
+
 from experiments.bench import paper_checks
+from experiments.core.charts import Panel, Series, draw
 from experiments.core.context import Context
-from experiments.core.results import Cell, Results, Table, at_most, named_table
+from experiments.core.look import PALETTE, SHARED
+from experiments.core.results import Cell, Picture, Results, Table, at_most, named_table
 from experiments.core.runner import Experiment
 from experiments.core.text import bounds
 from experiments.study import paper_numbers as paper
@@ -55,6 +59,21 @@ def run(config: PaperAuditConfig, context: Context) -> Results:
             _distance_table(),
             _vtv_table(config),
         ),
+        pictures=(
+            Picture(
+                name="distance",
+                title="OMAE against the error rate",
+                caption="Each wrong answer is at least one level off, so no row can lie below the diagonal; Touch-R1 "
+                "and the upper steps of its ablation do.",
+                content=distance_chart(),
+            ),
+            Picture(
+                name="average",
+                title="Avg against the mean of its columns",
+                caption="OMAE as 100(1 − OMAE/2), ρ as 100ρ.",
+                content=average_chart(),
+            ),
+        ),
     )
 
 
@@ -86,7 +105,7 @@ def _distance_table() -> Table:
         {"row": name, "1 − Acc": error, "OMAE": omae, "possible": name not in impossible}
         for name, (error, omae) in paper_checks.error_and_distance().items()
     ]
-    meanings = {"1 − Acc": "of the mean of H-, R- and P-Acc: no OMAE is less, for a wrong answer is a level off"}
+    meanings = {"1 − Acc": "of the mean of H-, R- and P-Acc: least possible OMAE"}
     return named_table("OMAE and its bound", rows, formats={"1 − Acc": ".3f", "OMAE": ".2f"}, meanings=meanings)
 
 
@@ -104,6 +123,35 @@ def _vtv_table(config: PaperAuditConfig) -> Table:
         units={"Touch-R1": "%", "VTV-LLM": "%", "gain": "points"},
         meanings={"95 %": "unpaired: the answers are not published"},
     )
+
+
+def distance_chart() -> bytes:
+    """OMAE over the error rate of the same row; no answers can lie below the diagonal."""
+    impossible, ends = paper_checks.impossible_distances(), np.array([0.25, 0.75])
+    diagonal = Series("OMAE = 1 − Acc; below it is impossible", x=ends, y=ends, marker="", line=":", colour=SHARED)
+    shaded = Series(x=ends, y=ends, low=[0, 0], band=True, marker="", line="", colour=PALETTE[1], alpha=0.4)
+    series = [shaded, diagonal]
+    every = paper_checks.error_and_distance()
+    for table, marker in (("main table", "o"), ("ablation", "D")):
+        rows = {name: row for name, row in every.items() if name.endswith("(ablation)") == (table == "ablation")}
+        x, y = zip(*rows.values(), strict=True)
+        labels = [name if name in impossible and not name.startswith("+") else "" for name in rows]
+        colour = [PALETTE[1] if name in impossible else PALETTE[0] for name in rows]
+        series.append(Series(table, x=x, y=y, marker=marker, line="", colour=colour, labels=labels))
+    x_label, y_label = "1 − mean of H-, R-, P-Acc", "OMAE, levels"
+    return draw([Panel(series, x_label=x_label, y_label=y_label, x_limits=(0.25, 0.75), y_limits=(0.15, 0.95))])
+
+
+def average_chart() -> bytes:
+    """Printed Avg and the plain mean of the nine columns, for every model."""
+    low, high, average = paper_checks.columns_as_scores()
+    mean = ((low + high) / 2).mean(1)
+    joined = Series(
+        x=average, low=np.minimum(average, mean), high=np.maximum(average, mean), marker="", colour="#cfd4da"
+    )
+    printed = Series("Avg as printed", x=average, colour=PALETTE[1], marker="o")
+    plain = Series("mean of the nine columns", x=mean, colour=PALETTE[0], marker="o")
+    return draw([Panel([joined, printed, plain], rows=list(paper.MAIN), x_label="points")])
 
 
 DEFAULT = PaperAuditConfig()
