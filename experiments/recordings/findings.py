@@ -12,8 +12,6 @@ from experiments.core.pictures import heatmaps
 from experiments.core.results import Picture, Table, named_table
 from experiments.core.text import bounds
 from experiments.recordings.cross_validation import (
-    FORMATS,
-    UNITS,
     CrossValidation,
     confidence,
     intervals,
@@ -173,29 +171,39 @@ def abstention(answers: JudgedAnswers) -> Picture:
     )
 
 
-def sim_to_real(split: CrossValidation) -> Table:
+def sim_to_real(split: CrossValidation) -> tuple[Picture, Table]:
     """Scores of probes that learn from scenes alone, from scenes and k real objects, and from k real objects alone."""
     config, videos, most = split.config, split.videos, len(np.unique(split.videos.objects))
     alone = dataclasses.replace(
         config, evidence=dataclasses.replace(config.evidence, families=tuple(dict.fromkeys(families())))
     )
+    counts = [k for k in REAL if k < most]
+    found: dict[str, dict[int, Interval]] = {}
     rows = []
     for name, chosen in (("scenes and real objects", config), ("real objects alone", alone)):
-        for k in REAL:
-            if k >= most or (k == 0 and chosen is alone):
+        found[name] = {}
+        for k in counts:
+            if k == 0 and chosen is alone:
                 continue
             log_prob = split.probes(chosen, objects=k) if k else scenes_alone(split)
-            found = intervals(choose(log_prob), videos.label, videos.objects)
-            means: dict[str, Any] = {key: one.mean for key, one in found.items()}
-            span = bounds(found["mean"].low, found["mean"].high, ".1f")
-            rows.append({"learned from": name, "real objects": k} | means | {"mean, 95 %": span})
-    return named_table(
-        "From scenes to real objects",
-        rows,
-        formats=FORMATS | {"real objects": "d"},
-        units=UNITS | {"OMAE": "levels"},
-        note="Probes alone, on the partition that settings were chosen on; intervals over objects.",
+            measured = intervals(choose(log_prob), videos.label, videos.objects)
+            found[name][k] = measured["mean"]
+            rows.append({"learned from": name, "real objects": k} | {key: one.mean for key, one in measured.items()})
+    formats = {key: ".3f" if key == "OMAE" else ".1f" for key in rows[0] if key not in ("learned from", "real objects")}
+    note = "Probes alone, on the partition that settings were chosen on."
+    units = {key: "levels" if key == "OMAE" else "%" for key in formats}
+    formats |= {"real objects": "d"}
+    table = named_table("From scenes to real objects", rows, formats=formats, units=units, note=note)
+    series = [estimates(name, [*at.values()], at=[*at]) for name, at in found.items()]
+    axes: dict[str, Any] = {"x_label": "real objects learned from", "y_label": "levels right (%)"}
+    panel = Panel(series, x_limits=(-2, None), y_limits=(30, 80), x_ticks={k: str(k) for k in counts}, **axes)
+    picture = Picture(
+        name="sim_to_real",
+        title="Training on scenes and on real objects",
+        caption=note + "  Bars are 95 % intervals over objects.",
+        content=draw([panel], size=(6.4, 3.6)),
     )
+    return picture, table
 
 
 def scenes_alone(split: CrossValidation) -> Float[np.ndarray, "n 27"]:

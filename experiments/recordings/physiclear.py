@@ -179,6 +179,7 @@ def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Resul
         ALL: intervals(pooled.levels, policy.truth, policy.owner),
         SUREST: policy.of_surest(0.5),
     }
+    curve, curve_table = findings.sim_to_real(elsewhere)
     gain = findings.gains(policy, regression)
     return Results(
         verdict=verdict(measured, gain["mean"], videos, len(config.seeds)),
@@ -187,12 +188,12 @@ def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Resul
             score_table("Unseen objects", methods, policy.truth, policy.owner, "Mean over the partitions."),
             findings.partition_table(policy, pooled, config.seeds),
             findings.people_table(people(videos), videos),
-            findings.sim_to_real(elsewhere),
+            curve_table,
             score("What contributes", {name: choose(rows) for name, rows in parts.items()}, _ELSEWHERE),
             score("What limits", elsewhere.label_limits(), _LIMITS),
             findings.object_table(videos, policy, pooled),
         ),
-        pictures=(findings.abstention(policy), findings.confusions(policy)),
+        pictures=(findings.abstention(policy), curve, findings.confusions(policy)),
         settings=settings(config, policy, videos),
         data={
             "objects": len(np.unique(videos.objects)),
