@@ -6,7 +6,8 @@ Compares raw frames, zstd and its kin, byte shuffle, differences in time, along 
 (the difference with the smallest residual, then zstd-1), PNG, WebP, HuffYUV and FFV1, on generated scenes and, where
 DIR holds the folders physiclear and gelslam, on real videos and on stills of a real camera: bytes a frame against
 frames written and read a second, on one core, in interleaved rounds.  A codec counts only where every bit comes back.
-Then measures the time of each part of making a clip and of each augmentation; `throughput_feed` measures feeds.
+Then measures the feed: the time of each part of making a clip, the cost of each augmentation, and the rate with reading
+processes.
 
 The rule for the default was set in advance.  Training needs 1600 frames a second (50 clips of 8 frames of 4 sensors).
 Of the codecs that read them on at most 15 % of a core, for generated and imported frames, the rule selects the codec
@@ -17,8 +18,11 @@ Cost: four minutes on one core; `--scale smoke` under one, without recordings.
 Expected: the records' own codec, at half to two thirds of the bytes of zstd-1, read as fast.
 """
 
+import contextlib
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import itertools
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +50,7 @@ from sensors_io.importers.keep import Keep
 from sensors_io.importers.pictures import numbered, read_picture
 from sensors_io.importers.video import read_video
 from sensors_io.live import LiveScenes
-from sensors_io.pipeline import ClipConfig, make_clip
+from sensors_io.pipeline import ClipConfig, clip_batches, make_clip
 from sensors_io.records import RecordStore
 from sensors_io.scenes.config import SceneConfig
 
@@ -69,24 +73,53 @@ CHANGES: Mapping[str, AugmentConfig | None] = {
 }
 """Augmentations whose time is measured."""
 
+_AHEAD = 3  # batches that a feed reads ahead in this process; each worker holds two more
+
 Rows = Mapping[str, Sequence[CodecMeasurement]]  # kind of clips → codecs measured on them
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class StorageConfig:
-    """Clips to store, and records from which clips are made."""
+class FeedConfig:
+    """Records and batches of the feed.
 
-    data_dir: Path | None = None  # folder of recordings; None for generated scenes alone
-    scenes: SceneConfig = SceneConfig(objects=4, sites=1, frames=90)  # generated clips
-    contacts: int = 2  # number of generated contacts
-    videos: int = 6  # number of real ones
-    rounds: int = 3  # of timing
-    records: SceneConfig = SceneConfig(objects=32, sites=1)  # scenes of the records
-    read_contacts: int = 8  # number of those that are made into clips
+    Args:
+      scenes: the records.
+      contacts: number of those that are timed one by one.
+      batch_size: clips of a batch.
+      batches: timed in each round.
+      workers: numbers of reading processes that are tried, 0 for none.
+    """
+
+    scenes: SceneConfig = SceneConfig(objects=32, sites=1)
+    contacts: int = 8
+    batch_size: int = 16
+    batches: int = 8
+    workers: tuple[int, ...] = (0, 1, 2)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StorageConfig:
+    """Clips to store, and the feed to time.
+
+    Args:
+      data_dir: folder of recordings; None for generated scenes alone.
+      scenes: generated clips.
+      contacts: number of generated contacts.
+      videos: number of real ones.
+      rounds: of timing.
+      feed: the feed.
+    """
+
+    data_dir: Path | None = None
+    scenes: SceneConfig = SceneConfig(objects=4, sites=1, frames=90)
+    contacts: int = 2
+    videos: int = 6
+    rounds: int = 3
+    feed: FeedConfig = FeedConfig()
 
 
 def run(config: StorageConfig, context: Context) -> Results:
-    """Store, make clips, compare."""
+    """Store, feed, compare."""
     clips = {GENERATED: generated_clips(config.scenes, context.each("making scenes", range(config.contacts)))}
     if config.data_dir is not None:
         clips |= recorded_clips(config.data_dir, config.videos, WHOLE_FRAMES, context)
@@ -97,9 +130,10 @@ def run(config: StorageConfig, context: Context) -> Results:
         rows[kind], absent = measure(all_codecs(), group, config.rounds, context)
         missing |= absent
     with context.progress_callback("making records") as report:
-        generate_records(config.records, context.directory / "records", progress=report)
+        generate_records(config.feed.scenes, context.directory / "records", progress=report)
     store = RecordStore(context.directory / "records")
-    parts = part_ms(config, store, context.rounds("timing the parts of a clip", config.rounds))
+    parts = part_ms(config.feed, store, context.rounds("timing the parts of a clip", config.rounds))
+    rates = feed_rates(config.feed, store, config.rounds, context)
     best = fastest_small(rows, NEED_FPS)
     filters = {kind: chosen_filters(context.each(f"filters, {kind}", group)) for kind, group in clips.items()}
     sizes = [f"{_bytes(g, OWN) / _bytes(g, 'raw'):.2f} ({kind})" for kind, g in rows.items()]
@@ -107,10 +141,11 @@ def run(config: StorageConfig, context: Context) -> Results:
         verdict=(
             f"Of the codecs that read {NEED_FPS:,.0f} frames/s the rule chooses {best.name}; records use {OWN}, which "
             f"takes {', '.join(sizes)} of the bytes of raw frames.",
-            f"A clip of 8 frames of 4 sensors costs {sum(list(parts.values())[:3]):.1f} ms of one core.",
+            f"A clip of 8 frames of 4 sensors costs {sum(list(parts.values())[:3]):.1f} ms of one core; the feed gives "
+            f"{rates[0, 'as recorded']:.0f} clips/s without reading processes.",
         ),
         requirements=_requirements(rows, best),
-        tables=(*(_codec_table(kind, r) for kind, r in rows.items()), _filter_table(filters), _part_table(parts)),
+        tables=(*(_codec_table(kind, r) for kind, r in rows.items()), *_other_tables(filters, parts, rates)),
         pictures=tuple(_picture(n, *row) for n, row in context.each("drawing", enumerate(rows.items()))),
         settings={
             "rule": f"reads {NEED_FPS:,.0f} frames/s: {TRAINING_FPS:,.0f} on {CORE_SHARE:.0%} of a core",
@@ -158,10 +193,13 @@ def fastest_small(rows: Rows, need_fps: float) -> Codec:
     return by_name[kinds[0]][min(fast, key=lambda name: size[name])].codec
 
 
-def part_ms(config: StorageConfig, store: RecordStore, rounds: Iterable[object]) -> dict[str, float]:
+# Feed ----------------------------------------------------------------------------------------------------------------
+
+
+def part_ms(config: FeedConfig, store: RecordStore, rounds: Iterable[object]) -> dict[str, float]:
     """Milliseconds of one core that each part of making one clip takes, by subtraction where parts are nested."""
-    clip = ClipConfig(image_px=config.records.image_px)
-    rows = range(min(config.read_contacts, len(store)))
+    clip = ClipConfig(image_px=config.scenes.image_px)
+    rows = range(min(config.contacts, len(store)))
     contacts = [store.contact(i, fields=False) for i in rows]
     cards = [store.objects[store.contacts[i].object_id] for i in rows]
     entries = [encode_sequence(sequence) for i in rows for sequence in store.contact(i).values()]
@@ -186,6 +224,32 @@ def part_ms(config: StorageConfig, store: RecordStore, rounds: Iterable[object])
         "choose, resize": ms["as recorded"],
         **{name: max(0.0, ms[name] - ms["as recorded"]) for name in CHANGES if CHANGES[name]},
     }
+
+
+def feed_rates(config: FeedConfig, store: RecordStore, rounds: int, context: Context) -> dict[tuple[int, str], float]:
+    """Clips a second by number of workers and by change, median over rounds.
+
+    One feed after the other: the workers of one that waits would read ahead in the time of another.  What a feed read
+    ahead before its own time begins is drawn first.
+    """
+    rates, clip = {}, ClipConfig(image_px=config.scenes.image_px)
+    for workers, name in itertools.product(config.workers, ("as recorded", "all of these")):
+        options: dict[str, Any] = {"batch_size": config.batch_size, "augment": CHANGES[name], "workers": workers}
+        feed = iter(clip_batches(store, np.arange(len(store)), clip, seed=0, **options))
+        seconds = []
+        with contextlib.closing(feed):
+            for _ in context.rounds(f"timing the feed {name}, {workers} processes", rounds):
+                _skip(feed, _AHEAD + 2 * workers)
+                began = time.perf_counter()
+                _skip(feed, config.batches)
+                seconds.append(time.perf_counter() - began)
+        rates[workers, name] = config.batches * config.batch_size / float(np.median(seconds))
+    return rates
+
+
+def _skip(feed: Iterator[Any], batches: int) -> None:
+    for _ in range(batches):
+        next(feed)
 
 
 # Report --------------------------------------------------------------------------------------------------------------
@@ -232,22 +296,32 @@ def _codec_table(kind: str, rows: Sequence[CodecMeasurement]) -> Table:
     )
 
 
-def _filter_table(filters: Mapping[str, Mapping[str, int]]) -> Table:
-    return named_table(
-        "The difference with the smallest residual",
-        [{"clips": kind, **counts} for kind, counts in filters.items()],
-        formats=dict.fromkeys(next(iter(filters.values())), "d"),
-        note="Smallest mean of |residual|, as in the PNG specification.",
-    )
-
-
-def _part_table(parts: Mapping[str, float]) -> Table:
-    return named_table(
-        "Time of the parts of a clip",
-        [{"part": part, "time": ms} for part, ms in parts.items()],
-        formats={"time": ".2f"},
-        units={"time": "ms of one core"},
-        note="The first three make a clip; each of the others is the cost of an augmentation.",
+def _other_tables(
+    filters: Mapping[str, Mapping[str, int]], parts: Mapping[str, float], rates: Mapping[tuple[int, str], float]
+) -> tuple[Table, ...]:
+    changes = list(dict.fromkeys(name for _, name in rates))
+    by_workers = {w: {name: rates[w, name] for name in changes} for w in dict.fromkeys(w for w, _ in rates)}
+    return (
+        named_table(
+            "The difference with the smallest residual",
+            [{"clips": kind, **counts} for kind, counts in filters.items()],
+            formats=dict.fromkeys(next(iter(filters.values())), "d"),
+            note="Smallest mean of |residual|, as in the PNG specification.",
+        ),
+        named_table(
+            "Time of the parts of a clip",
+            [{"part": part, "time": ms} for part, ms in parts.items()],
+            formats={"time": ".2f"},
+            units={"time": "ms of one core"},
+            note="The first three make a clip; each of the others is the cost of an augmentation.",
+        ),
+        named_table(
+            "Clips a second from the feed",
+            [{"reading processes": str(workers), **row} for workers, row in by_workers.items()],
+            formats=dict.fromkeys(changes, ".0f"),
+            units=dict.fromkeys(changes, "/s"),
+            note="One feed after the other; reading processes share the cores that the run has.",
+        ),
     )
 
 
@@ -288,8 +362,7 @@ SMOKE = StorageConfig(
     scenes=SceneConfig(objects=4, sites=1, frames=8),
     contacts=1,
     rounds=2,
-    records=SceneConfig(objects=4, sites=1),
-    read_contacts=2,
+    feed=FeedConfig(scenes=SceneConfig(objects=4, sites=1), contacts=2, batch_size=4, batches=2, workers=(0,)),
 )
 
 EXPERIMENT = Experiment(name="pareto_storage", config=DEFAULT, scales={"smoke": SMOKE}, run=run)

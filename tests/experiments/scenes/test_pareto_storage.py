@@ -7,7 +7,7 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.scenes import pareto_storage
-from experiments.scenes.pareto_storage import CHANGES, GENERATED, IMPORTED, STILLS, WHOLE, recorded_clips
+from experiments.scenes.pareto_storage import CHANGES, GENERATED, IMPORTED, STILLS, WHOLE, FeedConfig, recorded_clips
 from experiments.scenes.storage_codecs import OWN, CodecMeasurement, all_codecs, chosen_filters
 from tests.experiments import tiny
 from tests.experiments.shrunk import run_shrunk
@@ -20,8 +20,7 @@ TINY = pareto_storage.StorageConfig(
     contacts=1,
     videos=2,
     rounds=1,
-    records=tiny.SCENES,
-    read_contacts=1,
+    feed=FeedConfig(scenes=tiny.SCENES, contacts=1, batch_size=2, batches=1, workers=(0,)),
 )
 
 
@@ -49,7 +48,7 @@ def test_every_codec_gives_every_bit_back(codec, tmp_path):
 def test_the_report_holds_every_codec_on_every_kind_of_clips(recordings, tmp_path):
     directory = run_shrunk(pareto_storage, TINY, tmp_path, "--data-dir", str(recordings))
     results = read_json(directory / "results.json")
-    *codecs, filters, parts = (table["rows"] for table in results["tables"])
+    *codecs, filters, parts, _ = (table["rows"] for table in results["tables"])
     names = {codec.name for codec in all_codecs() if codec.kind != "video"}
     for table in codecs:
         rows = {row[0]: row for row in table}
