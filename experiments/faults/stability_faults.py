@@ -199,7 +199,7 @@ def damage_files(most: int | None, context: Context, scratch: Path) -> list[Dama
 def try_inputs(most: int | None, context: Context, scratch: Path) -> list[InputRow]:
     """Every bad input and its answer."""
     unfinished_run(scratch / "inputs")
-    rows = []
+    rows: list[InputRow] = []
     tried = enumerate(cases(scratch / "inputs")[:most])
     for i, case in context.each("trying bad inputs", tried, still=True):  # the commands' output is captured
         folder = scratch / f"case-{i}"
