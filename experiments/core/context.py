@@ -32,6 +32,7 @@ from sensors_io.arrays import ArraysError, load_arrays
 from sensors_io.json_files import CHECKSUM, seal, unseal
 from sensors_io.units import HERE, Launcher
 from touchr1_jax.distributed.processes import SINGLE_PROCESS, ProcessGroup, SingleDevice
+from touchr1_jax.training.compilation import drop_programs
 
 T = TypeVar("T")
 
@@ -174,7 +175,11 @@ class Context:
 
     @contextlib.contextmanager
     def compiling(self, program: str) -> Iterator[Callable[[], None]]:
-        """Let other threads that run a program wait until this one has compiled it and calls the given function."""
+        """Let other threads that run a program wait until this one has compiled it and calls the given function.
+
+        Programs of earlier stages are dropped first where there is no room for another (see `drop_programs`).
+        """
+        drop_programs()
         with self._lock:
             lock = self._compiling.setdefault(program, threading.Lock())
         with contextlib.ExitStack() as first:

@@ -9,7 +9,6 @@ from experiments.core.progress import TrainingSample
 from experiments.core.results import Table, named_table
 from touchr1_jax.rl.scoring import NONFINITE_IN
 from touchr1_jax.training.checkpoint import Checkpoints
-from touchr1_jax.training.compilation import drop_programs
 from touchr1_jax.training.loop import SKIPPED, Batches, Hooks, Log, LoopConfig, LoopTime, Step, fit
 
 STEPPING, WAITING = "in steps", "waiting for data"
@@ -49,7 +48,6 @@ def stage_hooks(
     """
     times, logs, left_out = LoopTime(), list[Log](), [0.0]
     folder = context.checkpoint_dir(stage)
-    drop_programs()
     with (
         Checkpoints(folder, better="higher" if scored else None, print_=context.print) as checkpoints,
         context.timed(stage),

@@ -126,7 +126,7 @@ def drop_programs(share: float = MAPPINGS_SHARE) -> bool:
         return False
     with MAPPINGS.open("rb") as lines:
         used = sum(1 for _ in lines)
-    if used < share * int(MAPPINGS_LIMIT.read_text()):
+    if used < share * int(MAPPINGS_LIMIT.read_text(encoding="ascii")):
         return False
     jax.clear_caches()
     gc.collect()
