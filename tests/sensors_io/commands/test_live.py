@@ -39,12 +39,17 @@ def press(tmp_path):
     return save(tmp_path / "A1.npz", 100, np.outer(load, [0, 0, -1.0]))
 
 
+def rate_hz(sequence) -> float:
+    """Numbers of frames depend on the load of the machine, the median time between two does not."""
+    return 1e9 / float(np.median(np.diff(sequence.host_time_ns)))
+
+
 def test_free_motion_is_recorded_from_a_replay(tmp_path, press, capsys):
     out = tmp_path / "records"
     args = ["record", "--out", out, "--object-id", "cup", "--free-s", "0.3", "replay", "--path", press]
     assert run(*args) == 0
     made = RecordStore(out).contact(0)["tac3d"]
-    assert 25 <= len(made) <= 40
+    assert rate_hz(made) == pytest.approx(100, rel=0.3)
     assert made.depth_mm.shape[1:] == (20, 20)
     assert "\n1 contacts written, 0 recovered, 0 incomplete" in capsys.readouterr().out  # on a line of its own
     assert run(*args) == 0
@@ -197,8 +202,8 @@ def test_two_sensors_are_recorded_into_one_contact(tmp_path, press):
     assert run("record", "--out", out, "--object-id", "cup", "--free-s", 0.4, "--sync", sync, "--port", 0, *bench) == 0
     made = RecordStore(out).contact(0)
     assert list(made) == ["gelsight_mini", "tac3d"]
-    assert 12 <= len(made["gelsight_mini"]) <= 25
-    assert 25 <= len(made["tac3d"]) <= 45
+    assert rate_hz(made["gelsight_mini"]) == pytest.approx(50, rel=0.3)
+    assert rate_hz(made["tac3d"]) == pytest.approx(100, rel=0.3)
     starts = [s.host_time_ns[0] for s in made.values()]
     assert -0.15e9 < starts[0] - starts[1] < -0.05e9
     assert made["gelsight_mini"].camera["recording"]["late_s"] == 0.1
