@@ -114,7 +114,8 @@ CLAIMS: tuple[Claim, ...] = (
         experiment="main_table",
         published="never compared",
         changes=(ClaimedChange(name="Avg of nine", metrics=("avg",), arm="full", against="sft_continued"),),
-        why="The paper lacks this control: SFT continued for the same time.",
+        why="The paper lacks this control: SFT continued for the same time. None of sixteen variants beats it "
+        "(`grpo_verdict`).",
     ),
     Claim(
         text="GRPO with 0/1 credit helps a little",
