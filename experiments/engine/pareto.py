@@ -59,7 +59,7 @@ DEFAULTS = (
 )  # fmt: skip
 
 CHARTS_ONLY = (
-    "pareto_chooser", "pareto_sft", "speed_grpo", "scaling", "throughput_scenes", "stability_contact",
+    "pareto_chooser", "pareto_sft", "speed_grpo", "scaling", "stability_contact",
     "stability_fields", "stability_encoder", "stability_grpo", "stability_devices",
 )  # fmt: skip
 """Experiments whose charts are shown without a default to judge."""
