@@ -64,6 +64,7 @@ def test_a_dense_layer_multiplies_with_the_decoded_matrix():
     jax.tree.map(np.testing.assert_array_equal, ours, theirs)
 
 
+@pytest.mark.long
 def test_a_policy_and_its_adapters_see_the_decoded_matrices():
     lora = LoraConfig(rank=2)
     stored = quantised(small_policy.params())
