@@ -23,12 +23,12 @@ def end_as_interrupted() -> None:
             signal.signal(number, _raise)
 
 
-def leave_interrupted(error: KeyboardInterrupt, told: str) -> int:
-    """Print what became of the work, let another signal end the process at once, and return the exit status."""
+def leave_interrupted(error: KeyboardInterrupt, message: str) -> int:
+    """Print a message, let another signal end the process at once, and return the exit status."""
     for number in (signal.SIGINT, *ENDING):
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, signal.SIG_DFL)
-    say(told)
+    say(message)
     return exit_status(error)
 
 

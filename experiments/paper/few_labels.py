@@ -10,7 +10,8 @@ sensors agree (`agreement`); or GRPO rewards the level that measured physics imp
 slope of force over indentation, roughness from friction force over load where a contact slides.  All policies are
 scored once on test objects.
 
-Cost: about half an hour on two cores; `--scale smoke` under two minutes.
+Cost: some two hours of one core by the time of its first sets, it was not run to its end; `--scale smoke` under two
+minutes.
 
 Expected: ten times as many labels help more than any method.  Label-free terms can help only where the agreed or
 measured level is right more often than the policy; the report shows how often it is right.

@@ -80,6 +80,14 @@ PRESSES_BY_ONE_SENSOR = {"motions": ("press",), "forces_n": (2.0,), "sensors": (
             },
             r"temperature is 0\.7: must be 1\.0 where a server draws rollouts",
         ),
+        (
+            "paper.touch_r1.DEFAULT",
+            {
+                "rollouts": RolloutsConfig(url="http://localhost:8000"),
+                "model": dataclasses.replace(touch_r1.DEFAULT.model, four_bits=True),
+            },
+            r"model\.four_bits is True: must be False where a server draws rollouts",
+        ),
         ("paper.touch_r1.DEFAULT", {"lora": LoraConfig(rank=0)}, r"lora\.rank is 0: must be at least 1, released"),
         (
             "paper.touch_r1.DEFAULT",

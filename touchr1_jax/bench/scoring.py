@@ -138,7 +138,7 @@ def _one_sensor(asks: Sequence[Ask], rows: list[int], answers: ItemAnswers) -> _
         if (asks[i].touches, asks[i].attributes, asks[i].answer) != (first.touches, first.attributes, first.answer):
             raise ValueError(
                 f"group {asks[i].group!r} holds {first.id!r} and {asks[i].id!r}: must be of one touch and property, "
-                "felt by one sensor each; give each touch a group of its own"
+                "each item with another sensor; give each touch a group of its own"
             )
     width = max(map(len, groups.values()))
     alone = np.full((len(groups), width, 1), BOTTOM)

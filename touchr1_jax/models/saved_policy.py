@@ -7,6 +7,7 @@ DIR/README.md           model card
 """
 
 import contextlib
+import ctypes
 import dataclasses
 import functools
 import glob
@@ -24,7 +25,6 @@ import jax.numpy as jnp
 import numpy as np
 from flax import traverse_util
 
-from touchr1_jax.models.exchange import exchanged
 from touchr1_jax.models.load import TOKENIZER_FILE, WeightsError
 from touchr1_jax.models.qwen.config import CONFIG_FILE
 from touchr1_jax.models.qwen.safetensors import read_header, read_tensor, write_file
@@ -40,6 +40,8 @@ FORMAT, VERSION = "touchr1-policy", 1
 CARD = "README.md"
 SCALE = ":step"
 """Ends the name of the steps of a tensor that is stored in whole numbers."""
+
+RENAME_SWAP = 2  # RENAME_EXCHANGE of Linux, the same of macOS
 
 CHECKSUM = "checksum"
 """Field of `config.json`: the SHA-256 of all other fields."""
@@ -159,6 +161,14 @@ def published(folder: Path, parts: Collection[str] = ()) -> Iterator[Path]:
     finally:
         for rest in (unfinished, old):
             shutil.rmtree(rest, ignore_errors=True)
+
+
+def exchanged(a: Path, b: Path) -> bool:
+    """Exchange two folders of one file system; False, and nothing is changed, where it cannot be done in one step."""
+    library, (source, target) = ctypes.CDLL(None), map(os.fsencode, (a, b))
+    if hasattr(library, "renameat2"):  # Linux; the paths begin at the working directory, AT_FDCWD
+        return library.renameat2(-100, source, -100, target, RENAME_SWAP) == 0
+    return hasattr(library, "renamex_np") and library.renamex_np(source, target, RENAME_SWAP) == 0
 
 
 def read_policy(folder: Path) -> SavedPolicy:

@@ -116,11 +116,11 @@ def return_memory() -> None:
 
 
 def drop_programs(share: float = MAPPINGS_SHARE) -> bool:
-    """Drop all compiled programs where the process uses this share of the memory mappings that Linux allows; whether.
+    """Drop all compiled programs, and return True, where the process uses this share of its memory mappings.
 
-    XLA maps each kernel of a program for CPUs, some 2,000 mappings a training step, and beyond the limit its compiler
-    ends the process (`vm.max_map_count`, by default 65,530).  A dropped program is compiled again when it is called, or
-    read from the cache of `compilations_kept`.
+    XLA maps each kernel of a program for CPUs, some 2,000 mappings a training step, and beyond the limit of Linux
+    (`vm.max_map_count`, by default 65,530) its compiler ends the process.  A dropped program is compiled again
+    when it is called, or read from the cache of `compilations_kept`.
     """
     if not MAPPINGS_LIMIT.exists():
         return False
