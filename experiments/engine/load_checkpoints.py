@@ -20,7 +20,7 @@ from experiments.core.progress import ProgressCallback
 from experiments.engine.processes import in_own_process
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.load import peak_memory
-from touchr1_jax.models.qwen.config import RELEASED, RELEASED_QWEN3, QwenConfig, QwenVisionConfig, released
+from touchr1_jax.models.qwen.config import RELEASED, QwenConfig, QwenVisionConfig
 from touchr1_jax.models.qwen.names import published, read, sources
 from touchr1_jax.models.qwen.safetensors import read_tensor, write_file
 from touchr1_jax.models.qwen.weights import INDEX, find_tensors, load_params
@@ -38,7 +38,7 @@ TINY = QwenConfig(
 
 def _with_released_tower(**changes: Any) -> QwenConfig:
     """The 3B's decoder with changes, and the released vision tower."""
-    decoder = dataclasses.replace(RELEASED["3B"], **changes)
+    decoder = dataclasses.replace(RELEASED["3B"].decoder, **changes)
     return QwenConfig(decoder=decoder, vision=QwenVisionConfig(out_size=decoder.hidden_size))
 
 
@@ -48,11 +48,9 @@ SHAPES: Mapping[str, QwenConfig] = {
         hidden_size=896, num_layers=24, num_heads=14, head_dim=64, intermediate_size=4864, mrope_section=(8, 12, 12)
     ),
     "1.5B": _with_released_tower(hidden_size=1536, num_layers=28, num_heads=12, intermediate_size=8960),
-    "3B": released("3B"),
-    "7B": released("7B"),
-    **RELEASED_QWEN3,
+    **RELEASED,
 }
-"""Size of the decoder → shape; 0.5B and 1.5B are decoders of Qwen2.5 with the tower of Qwen2.5-VL, as 3B and 7B."""
+"""Size of the decoder → shape; 0.5B and 1.5B are decoders of Qwen2.5 with the tower of Qwen2.5-VL."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -136,7 +136,7 @@ GPU = _study(
 PAPER_MODEL = ModelConfig(
     tactile=TactileViTConfig(sensors=0, width=1280, num_layers=32, num_heads=16, mlp_ratio=4),
     vision=VisionConfig(image_px=448, width=1280, num_layers=32, num_heads=16, mlp_ratio=4),
-    decoder=dataclasses.replace(RELEASED["7B"], vocab_size=0),
+    decoder=dataclasses.replace(RELEASED["7B"].decoder, vocab_size=0),
     frames=int(paper.HYPERPARAMETERS["frames of a sequence"]),
     image_px=int(paper.HYPERPARAMETERS["picture side"]),
 )

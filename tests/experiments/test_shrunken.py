@@ -218,7 +218,7 @@ RUNS = {
             indexed=(100, 2000),
             publications=2,
         ),
-        lambda m, r: [row[0] for row in rows(r, 3)] == [1, 10, 100, 1000] and rows(r)[0][2:4] == [2, 2],
+        lambda m, r: [row[0] for row in rows(r, 3)] == [1, 10, 100, 1000] and rows(r)[0][3:5] == [2, 2],
     ),
     "scene_gallery": Shrunk(
         lambda m: small(

@@ -21,6 +21,7 @@ from touchr1_jax.models.qwen.model import abstract_params
 from touchr1_jax.models.qwen.policy import qwen_policy
 from touchr1_jax.models.stacked import ADAPTERS, layer_by_layer
 from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.rl.config import at_precision
 from touchr1_jax.rl.grpo import FrozenInputs, GRPOState, make_grpo_step, start_state
 from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.rl.scoring import ScoreFn
@@ -119,7 +120,8 @@ def abstract_grpo(
         params = {ADAPTERS: jax.eval_shape(lambda k: init_adapters(k, decoder, lora), key)}
         fns = dataclasses.replace(fns, lora=lora)
     state = jax.eval_shape(lambda p, k: start_state(p, optimizer, k, shape.grpo), params, key)
-    return AbstractStep(fns, state, batch, FrozenInputs(reference=params, noise=of((draws, s, n, d), kind)), base)
+    reference = jax.eval_shape(lambda p: at_precision(shape.grpo, p), params)
+    return AbstractStep(fns, state, batch, FrozenInputs(reference=reference, noise=of((draws, s, n, d), kind)), base)
 
 
 def compile_grpo(

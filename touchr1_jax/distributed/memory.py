@@ -15,6 +15,7 @@ import jax.numpy as jnp
 
 from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.distributed.rules import state_shardings
+from touchr1_jax.models.layers import MOST_SCORES
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.rl.config import GRPOConfig, left_out
 from touchr1_jax.rl.grpo import FrozenInputs, GRPOState
@@ -146,7 +147,7 @@ def grpo_bytes(
         "noise bank": held({"noise": frozen.noise}),
         "batch": sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(batch)) // rows,
         "gradients": 2 * held(state.params),
-        "parameters in bfloat16": 2 * held(half) if shape.grpo.bfloat16 else 0,
+        "parameters in bfloat16": held(half) * (1 + (state.reference is not None)) if shape.grpo.bfloat16 else 0,
         "gathered weights": (2 * layer + _policies(shape) * head) * shape.number,
         "weights while sampling": _sampler_bytes(shape, (base, half if shape.grpo.bfloat16 else state.params)),
         "caches while sampling": cache_bytes(shape),
@@ -202,10 +203,11 @@ def saved_bytes(shape: GRPOShape) -> int:
 
 
 def attention_bytes(shape: GRPOShape) -> int:
-    """Scores, weights and their gradient of one layer, float32: each completion over its prompt and itself."""
+    """Scores, weights and their gradient of one layer, float32: each completion over its prompt and itself, as far as
+    they exist at once."""
     g, t = shape.grpo.group, shape.grpo.length
-    scores = g * shape.decoder.num_heads // shape.mesh.tensor * t * (shape.prompt_tokens + t)
-    return 3 * shape.micro_rows * scores * FLOAT
+    scores = min(g * shape.decoder.num_heads * t * (shape.prompt_tokens + t), MOST_SCORES)
+    return 3 * shape.micro_rows * scores // shape.mesh.tensor * FLOAT
 
 
 def logit_bytes(shape: GRPOShape) -> int:

@@ -42,12 +42,20 @@ def _as_dot_general(x: Array, w: Array, dimensions: Any, precision: Any = None) 
     return linear(x, w)
 
 
-def product_with_weights(primitive: Primitive, *_: Any, **__: Any) -> bool:
+CHEAP = 8
+"""Outputs for each input above which a product is repeated: an MLP has at most six, an adapter's second factor more."""
+
+
+def product_with_weights(primitive: Primitive, *shapes: Any, **_: Any) -> bool:
     """Policy of rematerialisation: the backward pass keeps results of `linear` and computes all else again.
 
-    JAX's own policies know `dot_general` alone; what is no weight, such as the scores of attention, is not kept.
+    JAX's own policies know `dot_general` alone; what is no weight, such as the scores of attention, is not kept, nor
+    is a product with few inputs and many outputs, which takes more memory than work.
     """
-    return primitive is linear_p
+    if primitive is not linear_p:
+        return False
+    inputs, outputs = shapes[1].shape
+    return outputs <= CHEAP * inputs
 
 
 class Dense(nn.Dense):

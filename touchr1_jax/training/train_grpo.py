@@ -18,7 +18,7 @@ from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.rewards import AnyReward, check_weights, total_reward
 from touchr1_jax.rewards.base import GROUP
 from touchr1_jax.rewards.proof import prove_rewards
-from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.rl.config import GRPOConfig, at_precision
 from touchr1_jax.rl.grpo import LEAN, FrozenInputs, GRPOState, make_grpo_step, start_state
 from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.rl.scoring import ScoreFn
@@ -81,7 +81,7 @@ def train_grpo(
     base = {name: tree for name, tree in start.items() if policy.fns.lora.rank and name != ADAPTERS}
     trained = {name: tree for name, tree in start.items() if name not in base}
     state = start_state(trained, optimizer, jax.random.key(seed), config)
-    constants = FrozenInputs(reference=trained, noise=noise), base
+    constants = FrozenInputs(reference=at_precision(config, trained), noise=noise), base
     step, state, batches = hooks.devices.shard(step, state, batches, config.drawn, *constants)
     if rollouts is not None:
         assert isinstance(policy, ReleasedPolicy)

@@ -72,7 +72,7 @@ def test_the_released_towers_are_taken_as_they_are(policy, streamed, checkpoint)
     assert (np.asarray(other["tactile_in"]["kernel"]) != np.asarray(params["tactile_in"]["kernel"])).any()
 
 
-@pytest.mark.parametrize("size", ["3B", "7B"])
+@pytest.mark.parametrize("size", ["3B", "7B", "32B"])
 def test_a_config_is_read_as_it_was_written(size):
     assert parse_config(json.loads(json.dumps(published_config(released(size))))) == released(size)
 

@@ -7,7 +7,7 @@ import pytest
 
 from tests.touchr1_jax import tiny
 from touchr1_jax.models.blocked_attention import PREFILL_ROWS, LayerCache, attend_causally
-from touchr1_jax.models.layers import MASKED, KeySource, attend
+from touchr1_jax.models.layers import MASKED, MOST_SCORES, KeySource, attend
 
 KV, R, D = 2, 3, 4
 
@@ -59,8 +59,9 @@ def test_keys_that_a_group_shares_get_the_sum_of_its_gradients():
     np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-5)
 
 
-def test_a_group_at_once_is_each_of_its_sequences_by_itself():
-    """Value and every gradient: one block of keys for all, one for each sequence."""
+@pytest.mark.parametrize("most", [MOST_SCORES, 500, 100])
+def test_a_group_at_once_is_each_of_its_sequences_by_itself(most):
+    """Value and every gradient: one block of keys for all, one for each sequence; all at once, or in 2 or 10 turns."""
     group, t = 3, 5
     args = (
         normal(0, group, t, KV, R, D),
@@ -73,7 +74,7 @@ def test_a_group_at_once_is_each_of_its_sequences_by_itself():
     weight = normal(5, group, t, KV * R * D)
 
     def at_once(q, k, v, own_k, own_v):
-        return jnp.sum(weight * attend(q, [KeySource(k, v, seen), KeySource(own_k, own_v, causal)]))
+        return jnp.sum(weight * attend(q, [KeySource(k, v, seen), KeySource(own_k, own_v, causal)], most))
 
     def one_by_one(q, k, v, own_k, own_v):
         each = jax.vmap(lambda q, a, b: naive(q, [KeySource(k, v, seen), KeySource(a, b, causal)]), in_axes=(0, 1, 1))

@@ -12,7 +12,7 @@ from jax.extend.core import jaxprs_in_params
 from tests.touchr1_jax.drawn import draw_params
 from touchr1_jax.models.layers import mrope
 from touchr1_jax.models.lm import DecoderConfig, DecoderLayer, Rematerialised
-from touchr1_jax.models.vmappable_dense import Dense, Embed, linear, linear_p
+from touchr1_jax.models.vmappable_dense import Dense, Embed, linear, linear_p, product_with_weights
 
 DECODER = DecoderConfig(vocab_size=16)
 RNG = np.random.default_rng(0)
@@ -87,6 +87,15 @@ def test_rematerialised_layers_multiply_with_no_weight_twice():
         cost = lambda p, layer=layer: jnp.sum(layer.apply(p, x, rotation, mask, method="over_prompt")[0] ** 2)
         found.append(products(jax.make_jaxpr(jax.grad(cost))(params).jaxpr))
     assert found[0] == found[1] < found[2]
+
+
+@pytest.mark.parametrize(("outputs", "repeated"), [(8, 0), (9, 1)])
+def test_a_product_with_few_inputs_and_many_outputs_is_repeated(outputs, repeated):
+    """As the second of an adapter, x A B with A [4, 1] and B [1, o]: x A is kept, (x A) B is not."""
+    a, b = jnp.ones((4, 1)), jnp.ones((1, outputs))
+    f = lambda x: jnp.sum(jnp.sin(linear(linear(x, a), b)))
+    count = lambda f: products(jax.make_jaxpr(jax.grad(f))(X).jaxpr)
+    assert count(jax.checkpoint(f, policy=product_with_weights)) == count(f) + repeated
 
 
 def test_types_are_joined_and_kept():

@@ -181,33 +181,20 @@ class QwenConfig:
             )
 
 
-RELEASED: Mapping[str, DecoderConfig] = {
-    "3B": DecoderConfig(
-        vocab_size=151936,
-        hidden_size=2048,
-        num_layers=36,
-        num_heads=16,
-        num_kv_heads=2,
+def _qwen2_5(width: int, num_layers: int, num_heads: int, num_kv_heads: int, mlp: int, **vision: Any) -> QwenConfig:
+    decoder = DecoderConfig(
+        vocab_size=151936 if width < 3584 else 152064,
+        hidden_size=width,
+        num_layers=num_layers,
+        num_heads=num_heads,
+        num_kv_heads=num_kv_heads,
         head_dim=128,
-        intermediate_size=11008,
+        intermediate_size=mlp,
         mrope_section=(16, 24, 24),
         rope_theta=1e6,
-        tie_embedding=True,
-    ),
-    "7B": DecoderConfig(
-        vocab_size=152064,
-        hidden_size=3584,
-        num_layers=28,
-        num_heads=28,
-        num_kv_heads=4,
-        head_dim=128,
-        intermediate_size=18944,
-        mrope_section=(16, 24, 24),
-        rope_theta=1e6,
-        tie_embedding=False,
-    ),
-}
-"""Decoders of Qwen2.5-VL's released checkpoints (arXiv 2502.13923, table 1)."""
+        tie_embedding=width < 3584,
+    )
+    return QwenConfig(decoder=decoder, vision=QwenVisionConfig(out_size=width, **vision))
 
 
 def _qwen3(width: int, num_layers: int, num_heads: int, mlp: int, **vision: Any) -> QwenConfig:
@@ -226,26 +213,27 @@ def _qwen3(width: int, num_layers: int, num_heads: int, mlp: int, **vision: Any)
     return QwenConfig(decoder=decoder, vision=Qwen3VisionConfig(out_size=width, **vision))
 
 
-RELEASED_QWEN3: Mapping[str, QwenConfig] = {
+RELEASED: Mapping[str, QwenConfig] = {
+    "3B": _qwen2_5(2048, 36, 16, 2, 11008),
+    "7B": _qwen2_5(3584, 28, 28, 4, 18944),
+    "32B": _qwen2_5(5120, 64, 40, 8, 27648, intermediate_size=3456),
     "Qwen3-VL-2B": _qwen3(2048, 28, 16, 6144),
     "Qwen3-VL-4B": _qwen3(2560, 36, 32, 9728),
     "Qwen3-VL-8B": _qwen3(
         4096, 36, 32, 12288, depth=27, hidden_size=1152, intermediate_size=4304, deepstack_layers=(8, 16, 24)
     ),
 }
-"""Shapes of the smaller dense Qwen3-VL (arXiv 2511.21631), as their `config.json` states them."""
+"""Shapes of released checkpoints: Qwen2.5-VL (arXiv 2502.13923, table 1, and the later 32B) and the smaller dense
+Qwen3-VL (arXiv 2511.21631), as their `config.json` states them.
+"""
 
 
 def released(size: str) -> QwenConfig:
-    """Shape of a released checkpoint, one of `RELEASED` or `RELEASED_QWEN3`.
+    """Shape of a released checkpoint, one of `RELEASED`.
 
     Raises:
       ValueError: another size.
     """
-    if size in RELEASED_QWEN3:
-        return RELEASED_QWEN3[size]
     if size not in RELEASED:
-        sizes = ", ".join((*RELEASED, *RELEASED_QWEN3))
-        raise ValueError(f"size is {size!r}: must be one of {sizes}; read others with read_config")
-    decoder = RELEASED[size]
-    return QwenConfig(decoder=decoder, vision=QwenVisionConfig(out_size=decoder.hidden_size))
+        raise ValueError(f"size is {size!r}: must be one of {', '.join(RELEASED)}; read others with read_config")
+    return RELEASED[size]

@@ -58,7 +58,13 @@ def write_shards(directory, weights: dict[str, np.ndarray], count: int = 3) -> N
 
 
 @pytest.mark.parametrize(
-    ("size", "count"), [("3B", 3_754_622_976), ("7B", 8_292_166_656), ("Qwen3-VL-4B", 4_437_815_808)]
+    ("size", "count"),
+    [
+        ("3B", 3_754_622_976),
+        ("7B", 8_292_166_656),
+        ("32B", 33_452_718_336),
+        ("Qwen3-VL-4B", 4_437_815_808),
+    ],
 )
 def test_released_sizes_have_as_many_parameters_as_published(size, count):
     """Half the `total_size` of the released index files, which count bytes of bfloat16."""
