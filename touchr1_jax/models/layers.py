@@ -144,8 +144,8 @@ class KeySource(NamedTuple):
 
 
 MOST_SCORES = 2**26
-"""Scores of attention that may exist at once, 256 MB in float32.  In a layer of the 7B, eight answers of 512 tokens after
-a prompt of 4 480 have eight times as many, and the backward pass needs three such arrays."""
+"""Scores of attention that may exist at once, 256 MB in float32.  In a layer of the 7B, eight answers of 512 tokens
+after a prompt of 4 480 have eight times as many; the backward pass needs three such arrays."""
 
 
 def attend(
