@@ -133,7 +133,8 @@ class CrossValidation:
         """Log-probabilities of the probes alone with something left out or added."""
         config, auxiliary, evidence = self.config, self.auxiliary, self.config.evidence
         change = lambda **new: dataclasses.replace(config, evidence=dataclasses.replace(evidence, **new))
-        only = lambda part: (change(families=tuple(f for f in SCENES if part in f)), auxiliary)
+        with_all = lambda families: (change(families=families, by_attribute=()), auxiliary)
+        only = lambda part: with_all(tuple(f for f in SCENES if part in f))
         own = tuple(dict.fromkeys(families()))
         one_set = {name: getattr(auxiliary, name)[:1] for name in ("scene_x", "scene_target")}
         few = {name: getattr(auxiliary, name)[:, ::10] for name in ("scene_x", "scene_target")}
@@ -144,9 +145,10 @@ class CrossValidation:
             "the same, one set of scenes": (config, dataclasses.replace(auxiliary, **one_set)),
             "the same, a tenth of the scenes": (config, dataclasses.replace(auxiliary, **few)),
             "the same, no unlabelled videos": (config, bare),
+            "the same, every attribute by every group": only("scenes"),
             **{f"the same, {reading} alone": only(f"scenes, {reading},") for reading in READINGS},
             **{f"the same, {' and '.join(kinds)} alone": only(f", {group}") for group, kinds in GROUPS.items()},
-            "probes of the description, no scenes": (change(families=own), auxiliary),
+            "probes of the description, no scenes": with_all(own),
         }
         every = self.context.each("variants of the probes", variants.items())
         return {name: self.probes(*variant) for name, variant in every}

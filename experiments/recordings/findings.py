@@ -174,9 +174,8 @@ def abstention(answers: JudgedAnswers) -> Picture:
 def sim_to_real(split: CrossValidation) -> tuple[Picture, Table]:
     """Scores of probes that learn from scenes alone, from scenes and k real objects, and from k real objects alone."""
     config, videos, most = split.config, split.videos, len(np.unique(split.videos.objects))
-    alone = dataclasses.replace(
-        config, evidence=dataclasses.replace(config.evidence, families=tuple(dict.fromkeys(families())))
-    )
+    own = dataclasses.replace(config.evidence, families=tuple(dict.fromkeys(families())), by_attribute=())
+    alone = dataclasses.replace(config, evidence=own)
     counts = [k for k in REAL if k < most]
     found: dict[str, dict[int, Interval]] = {}
     rows = []
@@ -209,11 +208,9 @@ def sim_to_real(split: CrossValidation) -> tuple[Picture, Table]:
 def scenes_alone(split: CrossValidation) -> Float[np.ndarray, "n 27"]:
     """Log-probabilities from the levels that scene probes predict; of real videos their mean and deviation are used."""
     config, auxiliary, x = split.config.evidence, split.auxiliary, split.videos.x.astype(np.float64)
-    chosen = dataclasses.replace(config, families=tuple(name for name in SCENES if name.endswith(", named")))
+    chosen = dataclasses.replace(config, families=tuple(name for name in SCENES if name.endswith(", levels")))
     world = np.concatenate([x, auxiliary.unlabelled]).astype(np.float64)
     sensed, _ = sense(auxiliary, world, x, chosen)
-    size = sensed.shape[1] // len(READINGS)
-    count = len(NAMES) * LEVELS
-    levels = np.mean([sensed[:, r * size : r * size + count] for r in range(len(READINGS))], 0)
-    p = np.clip(levels.reshape(len(x), len(NAMES), LEVELS), 0.02, 1)
+    levels = sensed.reshape(len(x), len(READINGS), len(NAMES), LEVELS).mean(1)
+    p = np.clip(levels, 0.02, 1)
     return joint_log_prob(p / p.sum(-1, keepdims=True))

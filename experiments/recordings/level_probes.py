@@ -6,12 +6,13 @@ one were half of two, is five points worse.
 The properties of generated scenes are known exactly and cost nothing.  Probes learn them from the same description, and
 their predictions for a real video are the inputs of the probes above.  Lamps, gels and hands differ between the worlds,
 so that only the order of touches within each is used: numbers are standardised each by its own world's mean and
-deviation, or replaced by their ranks.  Either way three groups of properties make a probe of their own, and the answer
-is the mean of the six, over scenes drawn with several seeds: which scenes were drawn, and which reading is chosen,
-changes single answers by more than any of them is better than the others.
+deviation, or replaced by their ranks.  Hardness is read from standardised numbers, protrusion from ranks, each by the
+levels of scenes alone; roughness from both, by levels and physics.  Predictions are means over scenes drawn with
+several seeds, since which were drawn changes single answers.
 """
 
 import dataclasses
+import itertools
 
 import numpy as np
 from jaxtyping import Float
@@ -31,20 +32,35 @@ from touchr1_jax.training.kernel_probe import (
 
 READINGS = ("standardised", "ranked")  # ways in which numbers of the two worlds are made comparable
 
-GROUPS = {"all": ("levels", "material", "physics"), "named": ("levels", "material"), "graded": ("levels", "physics")}
+GROUPS = {
+    "all": ("levels", "material", "physics"),
+    "named": ("levels", "material"),
+    "graded": ("levels", "physics"),
+    "levels": ("levels",),
+}
 """Groups of the properties of scenes, each read by a probe of its own."""
 
 SCENES = tuple(f"scenes, {reading}, {group}" for reading in READINGS for group in GROUPS)
 """Families of the numbers that scene probes predict."""
+
+BY_ATTRIBUTE = (
+    ("scenes, standardised, levels",),
+    ("scenes, standardised, graded", "scenes, ranked, graded"),
+    ("scenes, ranked, levels",),
+)
+"""Families by which hardness, roughness and protrusion are read."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LevelProbeConfig(KernelProbeConfig):
     """The probes; families other than those of the description are the predictions of scene probes."""
 
-    families: tuple[str, ...] = SCENES
+    families: tuple[str, ...] = tuple(dict.fromkeys(itertools.chain(*BY_ATTRIBUTE)))
+    by_attribute: tuple[tuple[str, ...], ...] = BY_ATTRIBUTE
+    """Those of the families by which each attribute is read; (), and all read every attribute."""
+    ridge: float = 0.7
     scene_ridge: float = 10.0
-    """λ of the scene probes, ten times that of the others: they are read on another world than they are fitted on, and
+    """λ of the scene probes, far above that of the others: they are read on another world than they are fitted on, and
     with λ = 1 the answers about real objects depend on which scenes were drawn.
     """
     rating_share: float = 0.5  # of the ratings in the targets, see `graded_targets`
@@ -79,13 +95,20 @@ class ProbedVideos:
         target = np.concatenate([self.target, np.zeros((len(self._others), *self.target.shape[1:]))])
         weight = np.concatenate([self._weight, np.zeros(len(self._others))])
         rows = np.concatenate([self._fitted, self._others])
-        return probe(rows, target, weight, self._family, self._config)[n:].mean(1)
+        return self._mean(probe(rows, target, weight, self._family, self._config)[n:])
 
     def crossed(self, seed: int) -> Float[np.ndarray, "n A K"]:
         """Predictions for the training videos by probes that were fitted without the object in question."""
         objects = self._training.objects
         found = cross_probe(self._fitted, self.target, self._weight, objects, self._family, self._config, seed)
-        return found.mean(1)
+        return self._mean(found)
+
+    def _mean(self, p: Float[np.ndarray, "n M A K"]) -> Float[np.ndarray, "n A K"]:
+        """Mean over the families by which each attribute is read."""
+        families, by_attribute = self._config.families, self._config.by_attribute
+        chosen = by_attribute or (families,) * p.shape[2]
+        of = lambda a: p[:, [families.index(name) for name in chosen[a]], a].mean(1)
+        return np.stack([of(a) for a in range(p.shape[2])], 1)
 
 
 def sense(

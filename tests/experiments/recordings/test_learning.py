@@ -12,7 +12,7 @@ from experiments.core.context import Context, read_metrics
 from experiments.core.loops import stage_hooks
 from experiments.recordings.descriptions import AuxiliaryData, DescribedVideos
 from experiments.recordings.learning import LearnConfig, answer_log_probs, learn, load, save
-from experiments.recordings.level_probes import LevelProbeConfig
+from experiments.recordings.level_probes import BY_ATTRIBUTE, LevelProbeConfig, ProbedVideos
 from sensors_io.importers.keep import ImportSourceError
 from sensors_io.touches import families
 from touchr1_jax.models.description_policy import COMBINATIONS, LENGTH, PolicyShape, choose, description_policy
@@ -51,6 +51,16 @@ def worlds(objects=12, videos=2, seed=0):
     )
     x = described(made)
     return real, AuxiliaryData(scene_x=x[None], scene_target=target[None], kinds=kinds, unlabelled=described(made)[:5])
+
+
+def test_each_attribute_is_read_by_its_own_families():
+    videos, auxiliary = worlds()
+    read = lambda config: ProbedVideos(videos, auxiliary, videos, config).evidence()
+    found = read(LevelProbeConfig())
+    for a, own in enumerate(BY_ATTRIBUTE):
+        alone = read(LevelProbeConfig(families=own, by_attribute=()))
+        np.testing.assert_array_equal(found[:, a], alone[:, a])
+        assert (found != alone).any()
 
 
 def run_context(home):
