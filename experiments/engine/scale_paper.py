@@ -10,7 +10,7 @@ and for adapters on a frozen base, memory is counted; `--compiled N` compiles mo
 run a study with `--distributed --mesh.fsdp 8 --mesh.tensor 2`, in one process per GPU under Slurm, with `grpo.remat`,
 `grpo.bfloat16` and one prompt a micro-batch.
 
-Cost: a minute and a half of one core for each setup that `h200` compiles, more for `cpu`; `--scale smoke` half a minute.
+Cost: a minute and a half of one core for each setup that `h200` compiles; `--scale smoke` half a minute.
 
 Expected: 43 of 141 GB on each device, 32 with adapters (`--compiled 2`); some 5 s a step at the assumed shares of peak,
 two thirds of it learning: sampling gathers the sharded weights once, not at every token.  The 32B on 64 devices

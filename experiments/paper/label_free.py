@@ -31,12 +31,12 @@ def agreed_levels(evaluation: Evaluation, label: Int[np.ndarray, "n A"]) -> Int[
 
 
 def measured_levels(store: Contacts, rows: Int[np.ndarray, "n"]) -> Int[np.ndarray, "contact A"]:
-    """Levels of hardness and roughness that the ranks of stiffness and friction among the contacts imply, else −1."""
+    """Levels of hardness and roughness that the ranks of yielding and friction among the contacts imply, else −1."""
     found = np.full((len(store), len(ATTRIBUTES)), UNKNOWN)
     values = {"hardness": dict[int, dict[str, float]](), "roughness": dict[int, dict[str, float]]()}
     for i in map(int, rows):
         for sensor, sequence in store.contact(i, fields=True).items():
-            for name, value in (("hardness", stiffness(sequence)), ("roughness", friction(sequence))):
+            for name, value in (("hardness", yielding(sequence)), ("roughness", friction(sequence))):
                 if value is not None:
                     values[name].setdefault(i, {})[sensor] = value
     for name, of_contacts in values.items():
@@ -46,12 +46,16 @@ def measured_levels(store: Contacts, rows: Int[np.ndarray, "n"]) -> Int[np.ndarr
     return found
 
 
-def stiffness(sequence: Sequence) -> float | None:
-    """Slope of force over indentation, N/mm; `None` where it cannot be measured."""
+def yielding(sequence: Sequence) -> float | None:
+    """Minus the slope of force over indentation, N/mm; `None` where it cannot be measured.
+
+    The indentation is the gel's: under a soft object the contact spreads, and the slope is greater.
+    """
     try:
-        return measure(sequence).quantities.get("stiffness")
+        slope = measure(sequence).quantities.get("stiffness")
     except MeasureError:
         return None
+    return None if slope is None else -slope
 
 
 def friction(sequence: Sequence) -> float | None:

@@ -5,7 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from experiments.paper.label_free import agreed_levels, friction, levels_of_ranks, mean_ranks
+from experiments.paper.label_free import agreed_levels, friction, levels_of_ranks, mean_ranks, measured_levels
+from sensors_io.generate import generate_records
+from sensors_io.records import RecordStore
+from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import ContactKey, Phase, Sequence
 from touchr1_jax.training.evaluation import Evaluation
 from touchr1_jax.types import Parsed
@@ -44,6 +47,17 @@ def test_ranks_between_the_bands_imply_nothing():
     np.testing.assert_array_equal(
         levels_of_ranks(np.array([0, 0.28, 0.3, 0.5, 0.65, 0.72, 1])), [0, 0, -1, 1, -1, 2, 2]
     )
+
+
+@pytest.mark.long
+def test_measured_hardness_is_right_more_often_than_chance(tmp_path):
+    """Hard objects indent the gel more: a rank of the wrong sign is right in a sixth of the contacts."""
+    scenes = SceneConfig(objects=60, sites=1, image_px=28, view_px=28, contact_grid=32)
+    generate_records(scenes, tmp_path)
+    store = RecordStore(tmp_path)
+    level = measured_levels(store, np.arange(len(store)))[:, 0]
+    label = np.array([store.objects[key.object_id].label_row()[0] for key in store.contacts])
+    assert (level == label)[level >= 0].mean() > 0.45
 
 
 def sequence(motion: str, force_n: list[list[float]] | None) -> Sequence:
