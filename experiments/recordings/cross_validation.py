@@ -19,7 +19,7 @@ from experiments.recordings.level_probes import GROUPS, READINGS, SCENES, Probed
 from sensors_io.touches import families
 from touchr1_jax.bench.metrics import Scores, accuracy, mean_accuracy, ordinal_mae
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
-from touchr1_jax.models.description_policy import COMBINATIONS, LANGUAGE, LEVELS, choose, utility
+from touchr1_jax.models.description_policy import COMBINATIONS, LANGUAGE, LEVELS, choose
 from touchr1_jax.training.kernel_probe import object_weights, standardise
 
 SHARPNESS = 3.0  # power of a probe's probabilities: ridge regression shrinks them, as `reading_lesson` says
@@ -212,8 +212,13 @@ def pool(log_prob: Float[np.ndarray, "n 27"], objects: np.ndarray) -> Float[np.n
 
 
 def confidence(log_prob: Float[np.ndarray, "n 27"]) -> Float[np.ndarray, "n"]:
-    """Expected utility of the best answer, by which the surest answers are found."""
-    return (np.exp(log_prob) @ utility().T).max(-1)
+    """Minus the expected distance of the answer from the truth, levels: the surest answers have the greatest.
+
+    Of probabilities without the power of `joint_log_prob`, which is near 1 for every level that is ahead.
+    """
+    p = marginals(log_prob) ** (1 / SHARPNESS)
+    distance = np.abs(np.arange(LEVELS) - choose(log_prob)[..., None])
+    return -(p / p.sum(-1, keepdims=True) * distance).sum(-1).mean(-1)
 
 
 def agreement(answer: Int[np.ndarray, "n A"], objects: np.ndarray) -> float:
