@@ -26,7 +26,7 @@ from touchr1_jax.rl.stream_check import check_streams, stream_influence
 from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.text.language import Language
 from touchr1_jax.text.template import LevelTokens
-from touchr1_jax.training.loop import SILENT, Batches, Hooks, LoopConfig, fit_best, peek
+from touchr1_jax.training.loop import SILENT, Batches, Hooks, LoopConfig, SingleDevice, fit_best, peek
 from touchr1_jax.training.optimizer import falling_adamw
 from touchr1_jax.training.rollout_server import RolloutServer
 from touchr1_jax.training.train_sft import joined
@@ -66,9 +66,14 @@ def train_grpo(
 
     Raises:
       ValueError: `held_out` without checkpoints, a first batch without touch, a stream whose touch does not reach the
-        policy; as `RolloutServer.check`.
+        policy, lean compilation on several devices; as `RolloutServer.check`.
       RolloutError: as `RolloutServer.rollouts`.
     """
+    if config.lean_compilation and hooks.devices.shape != SingleDevice.shape:
+        raise ValueError(
+            f"lean_compilation is True: must be False on a mesh of {hooks.devices.shape}, which compiles without it; "
+            "leave it out"
+        )
     constraint = policy.constraint if config.algorithm.constrained else None
     levels = None if config.algorithm.enumerated is None else policy.level_tokens
     gather = hooks.devices.gather_params
