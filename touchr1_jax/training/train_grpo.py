@@ -69,11 +69,6 @@ def train_grpo(
         policy, lean compilation on several devices; as `RolloutServer.check`.
       RolloutError: as `RolloutServer.rollouts`.
     """
-    if config.lean_compilation and hooks.devices.shape != SingleDevice.shape:
-        raise ValueError(
-            f"lean_compilation is True: must be False on a mesh of {hooks.devices.shape}, which compiles without it; "
-            "leave it out"
-        )
     constraint = policy.constraint if config.algorithm.constrained else None
     levels = None if config.algorithm.enumerated is None else policy.level_tokens
     gather = hooks.devices.gather_params
@@ -166,8 +161,10 @@ def check_whole_batch(
     """`check_streams` of the first batch, of all rows that all processes read, so that all of them decide alike.
 
     Raises:
-      ValueError: as `check_streams`.
+      ValueError: as `check_streams`; lean compilation on several devices, which would compile without it.
     """
+    if config.lean_compilation and hooks.devices.shape != SingleDevice.shape:
+        raise ValueError(f"lean_compilation is True: must be False on a mesh of {hooks.devices.shape}; leave it out")
     program, key = influence_program(fns, config.length), jax.random.key(seed)
     frozen = FrozenInputs(reference=(), noise=noise)
     check, placed, rows = hooks.devices.shard(program, decoder, batches, config.drawn, frozen, key)

@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 from tests.touchr1_jax import tiny
-from tests.touchr1_jax.rl.test_grpo import score
-from touchr1_jax.models.touch_policy import ModelConfig, build_policy
 from touchr1_jax.rl.config import GRPOConfig
-from touchr1_jax.training.loop import Hooks, LoopConfig, SingleDevice
-from touchr1_jax.training.train_grpo import check_whole_batch, train_grpo
+from touchr1_jax.training.loop import Hooks, SingleDevice
+from touchr1_jax.training.train_grpo import check_whole_batch
 
 P = 3
 CONFIG = GRPOConfig(prompts=P, micro_prompts=P, length=3)
@@ -71,6 +69,5 @@ def test_lean_compilation_is_refused_on_a_mesh_which_would_ignore_it():
     devices = SingleDevice()
     devices.shape = (2, 1, 1)
     config = dataclasses.replace(CONFIG, lean_compilation=True)
-    policy, hooks = build_policy(ModelConfig(), ("gelsight_mini",)), Hooks(devices=devices)
     with pytest.raises(ValueError, match=r"lean_compilation is True: must be False on a mesh of \(2, 1, 1\)"):
-        train_grpo(policy, {}, Repeated(WHOLE), score, config, LoopConfig(steps=1), hooks, noise=NOISE)
+        check_whole_batch(tiny.SHALLOW, {}, Repeated(WHOLE), config, Hooks(devices=devices), NOISE, 0)
