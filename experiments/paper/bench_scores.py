@@ -53,8 +53,9 @@ class SingleTouchAnswers:
         n = np.arange(len(answers.contact))
         together = concluded(answers)
         level[answers.contact, answers.attribute] = together
-        repeated = np.repeat(together[:, None], streams, 1)
-        single = repeated if answers.alone is None else answers.alone[n, :, answers.attribute]
+        single = np.repeat(together[:, None], streams, 1)
+        if answers.alone is not None:  # of a sensor that recorded nothing the answer is to a prompt without touch
+            single = np.where(answers.streams, answers.alone[n, :, answers.attribute], BOTTOM)
         alone[answers.contact, :, answers.attribute] = single
         return SingleTouchAnswers(level=level, alone=alone)
 

@@ -157,6 +157,8 @@ class Algorithm:
                 raise ValueError(f"{field} is {getattr(self, field)}: {needs}")
         if self.kl_in_reward and self.advantage is Advantage.PER_REWARD:
             raise ValueError("kl_in_reward is True: must be False for PER_REWARD, whose σ takes beta away; change one")
+        if self.segment_credit and self.surrogate is Surrogate.SEQUENCE:  # its gradient is that of the credits' mean
+            raise ValueError("segment_credit is True: must be False for surrogate SEQUENCE, one ratio; change either")
         idle = ("learn_conclusion", "enumerated"), ("importance_sequence", "importance_cap")
         for field, needed in (*idle, ("reference_share", "reference_every")):
             if getattr(self, field) != getattr(type(self), field) and getattr(self, needed) is None:
@@ -355,17 +357,14 @@ class GRPOConfig:
                 f"group is {self.group}: must be at least 2: a rollout is compared with its group; raise it, or choose "
                 "advantage GLOBAL without enumerated"
             )
-        if self.algorithm.best_of > 1 and (
-            self.algorithm.best_of > self.group or self.algorithm.advantage is Advantage.PER_REWARD
-        ):
+        apart = self.algorithm.advantage is Advantage.PER_REWARD or self.algorithm.segment_credit
+        if (best_of := self.algorithm.best_of) > 1 and (best_of > self.group or apart):
             raise ValueError(
-                f"best_of is {self.algorithm.best_of}: must be at most group {self.group}, and 1 for advantage "
-                "PER_REWARD, which has no total to take the best of; lower it"
+                f"best_of is {best_of}: must be at most group {self.group}, and 1 for advantage PER_REWARD and for "
+                "segment_credit, which have no total to take the best of; lower it"
             )
         if list(self.buckets) != sorted({*self.buckets} & set(range(2, self.length))):
-            raise ValueError(
-                f"buckets is {self.buckets}: must ascend within 2 … length − 1 = {self.length - 1}; sort it"
-            )
+            raise ValueError(f"buckets is {self.buckets}: must ascend within 2 … {self.length - 1}; sort it")
 
     @property
     def drawn(self) -> int:

@@ -63,6 +63,8 @@ def level_rewards(
 ) -> tuple[LevelRewards, Bool[Array, "P"], dict[str, Float[Array, ""]]]:
     """Rewards of all completions with each level in turn as their conclusion; tokens after it stay as sampled.
 
+    A reward of a group sees the same level in all of its completions: `diversity` pays for traces that differ alone.
+
     Args:
       reward_of: rewards of groups of completions with that level, which their tokens name.
       levels: token of each level, and the one that opens the conclusion.

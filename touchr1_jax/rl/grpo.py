@@ -39,7 +39,7 @@ from touchr1_jax.rl.config import Average, GRPOConfig, TactileUse, at_precision,
 from touchr1_jax.rl.counterfactual import mask_one_stream
 from touchr1_jax.rl.enumerated import LevelRewards, all_equal, level_rewards
 from touchr1_jax.rl.gradient import Experience, log_probs
-from touchr1_jax.rl.losses import over_tokens
+from touchr1_jax.rl.losses import check_centering, over_tokens
 from touchr1_jax.rl.metrics import (
     advantage_metrics,
     answer_metrics,
@@ -157,7 +157,7 @@ def make_grpo_step(
     Raises:
       ValueError: an algorithm that samples constrained, without a constraint; one that enumerates conclusions, without
         the tokens of the levels; one that credits segments, with a score that `make_score` did not make; one
-        with stable rewards, with a score of published ones; lean compilation where jax has none.
+        with stable rewards, with a score of published ones; lean compilation where jax has none; as `check_centering`.
     """
     if config.lean_compilation and not compiles_leanly():
         raise ValueError(
@@ -172,6 +172,8 @@ def make_grpo_step(
         raise ValueError("constrained is True, but there is no constraint; make one with `compile_constraint`")
     if config.algorithm.enumerated is not None and levels is None:
         raise ValueError("enumerated is set, but there are no tokens of levels; make them with `level_tokens`")
+    if config.algorithm.score_centering:
+        check_centering(config.algorithm)
     if config.algorithm.stable_rewards:
         require_stable_rewards(score)
     if config.bfloat16:

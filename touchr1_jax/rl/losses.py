@@ -189,9 +189,9 @@ def too_far(algorithm: Algorithm, log_ratio: Float[Array, "*n T"], mask: Bool[Ar
 def mismatch_parts(
     gap: Float[Array, "P G T"], mask: Bool[Array, "P G T"], dropped: Bool[Array, "P G"]
 ) -> dict[str, Float[Array, "P"]]:
-    """Mean and largest |gap| of the drawn tokens of each prompt, and its share of dropped rollouts."""
+    """Mean and largest |gap| of the drawn tokens of each prompt that count, and its share of dropped rollouts."""
     return {
-        "sampler_gap": jnp.mean(masked.mean(jnp.abs(gap), mask, -1), -1),
+        "sampler_gap": masked.mean(masked.mean(jnp.abs(gap), mask, -1), jnp.any(mask, -1), -1),
         "sampler_gap_peak": jnp.max(jnp.where(mask, jnp.abs(gap), 0.0), (-2, -1)),
         "dropped_share": jnp.mean(dropped, -1),
     }

@@ -55,8 +55,8 @@ def noise_bank(
 ) -> Float[Array, "K S N D"]:
     """Encoded noise streams: pixels and forces drawn from N(μ, σ²) at each sensor's statistics, per channel.
 
-    The statistics are those of the batch's recorded frames; frame times are those of its contacts, so that nothing but
-    the touch itself is out of the ordinary.
+    The statistics are those of the batch's recorded frames; frame times are those of the contacts that a sensor
+    recorded, so that nothing but the touch itself is out of the ordinary.
 
     Args:
       fns, params: of the encoder.
@@ -68,9 +68,10 @@ def noise_bank(
     frames, force_n = np.asarray(batch.frames), np.asarray(batch.force_n)
     pixel = _statistics(frames.astype(np.float32) * recorded[..., None, None, None], (0, 2, 3, 4))
     force = _statistics(force_n * recorded[..., None], (0, 2))
-    rows = np.arange(draws) % len(batch.frame_index)
+    there = np.asarray(batch.frame_mask).any(-1).T
+    rows = np.stack([np.resize(np.flatnonzero(x) if x.any() else np.arange(len(x)), draws) for x in there], 1)
     keys = jax.random.split(jax.random.key(seed), draws)
-    times = jnp.asarray(batch.frame_index[rows]), jnp.asarray(batch.frame_mask[rows])
+    times = (jnp.asarray(np.take_along_axis(x, rows[..., None], 0)) for x in (batch.frame_index, batch.frame_mask))
     return noise_program(fns, frames.shape[3:5])(params, pixel, force, (keys, *times))
 
 

@@ -26,7 +26,7 @@ from touchr1_jax.rl.stream_check import check_streams, stream_influence
 from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.text.language import Language
 from touchr1_jax.text.template import LevelTokens
-from touchr1_jax.training.loop import SILENT, Batches, Hooks, LoopConfig, fit_best, peek
+from touchr1_jax.training.loop import SILENT, Batches, Hooks, LoopConfig, SingleDevice, fit_best, peek
 from touchr1_jax.training.optimizer import falling_adamw
 from touchr1_jax.training.rollout_server import RolloutServer
 from touchr1_jax.training.train_sft import joined
@@ -66,7 +66,7 @@ def train_grpo(
 
     Raises:
       ValueError: `held_out` without checkpoints, a first batch without touch, a stream whose touch does not reach the
-        policy; as `RolloutServer.check`.
+        policy, lean compilation on several devices; as `RolloutServer.check`.
       RolloutError: as `RolloutServer.rollouts`.
     """
     constraint = policy.constraint if config.algorithm.constrained else None
@@ -161,8 +161,10 @@ def check_whole_batch(
     """`check_streams` of the first batch, of all rows that all processes read, so that all of them decide alike.
 
     Raises:
-      ValueError: as `check_streams`.
+      ValueError: as `check_streams`; lean compilation on several devices, which would compile without it.
     """
+    if config.lean_compilation and hooks.devices.shape != SingleDevice.shape:
+        raise ValueError(f"lean_compilation is True: must be False on a mesh of {hooks.devices.shape}; leave it out")
     program, key = influence_program(fns, config.length), jax.random.key(seed)
     frozen = FrozenInputs(reference=(), noise=noise)
     check, placed, rows = hooks.devices.shard(program, decoder, batches, config.drawn, frozen, key)

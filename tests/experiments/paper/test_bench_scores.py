@@ -12,6 +12,8 @@ from touchr1_jax.bench.averages import touch_average
 from touchr1_jax.bench.comparison import ORDERS
 from touchr1_jax.bench.items import Ask, Touch
 from touchr1_jax.bench.scoring import score
+from touchr1_jax.training.evaluation import Evaluation
+from touchr1_jax.types import Parsed
 
 SENSORS = ("xense", "tac3d")
 TOUCHES = tuple(Touch(object=name, site=0, motion="press", trial=0) for name in "abcdef")
@@ -56,6 +58,27 @@ TIES = of_hardness([1, 1, 1], alone=[[2, 1], [1, 1], [-1, 0]])
 def test_answers_follow_from_single_touches(question, answers, expected):
     """Touches compare by level, equal levels by the mean of single sensors, which never outweighs a level."""
     assert answer_all([question], answers, PLACES, SENSORS) == {question.id: expected}
+
+
+def test_what_is_answered_without_any_touch_is_no_answer_of_a_sensor():
+    """The second contact lacks sensor 1: its prompt shows nothing then, and must not break the tie."""
+    conclude = np.full((2, 4), -1)
+    conclude[:, 0] = 1
+    nothing, alone = np.full((2, 2, 4), -1), np.full((2, 2, 4), -1)
+    alone[..., 0] = [[1, 1], [1, 2]]
+    flag, of = np.ones(2, bool), {"perceive": nothing, "compare": conclude, "conclude": conclude}
+    answers = Evaluation(
+        contact=np.arange(2),
+        attribute=np.zeros(2, int),
+        streams=np.array([[True, True], [True, False]]),
+        tokens=np.zeros((2, 0), int),
+        parsed=Parsed(**of, formatted=flag, truncated=~flag, length=np.zeros(2, int)),
+        label=conclude,
+        alone=alone,
+    )
+    single = SingleTouchAnswers.of(answers, 2)
+    assert single.alone[:, :, 0].tolist() == [[1, 1], [1, -1]]
+    assert single.strength(0, 0) == single.strength(1, 0)
 
 
 def everything() -> tuple[Ask, ...]:

@@ -77,6 +77,14 @@ def test_a_group_of_one_has_nothing_to_be_compared_with():
     assert GRPOConfig(group=1, algorithm=ReinforcePlusPlus()).group == 1
 
 
+def test_segments_are_credited_only_where_a_token_has_a_credit_of_its_own():
+    """The best of k rewards is none of their sums; one ratio for all tokens gives each the mean of their credits."""
+    with pytest.raises(ValueError, match=r"best_of is 2: must be .* 1 for .* segment_credit"):
+        GRPOConfig(algorithm=Paper(best_of=2, segment_credit=True))
+    with pytest.raises(ValueError, match="segment_credit is True: must be False for surrogate SEQUENCE"):
+        Gspo(segment_credit=True)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -18,6 +18,7 @@ from touchr1_jax.rl.losses import (
     expected_score,
     group_mean,
     grpo_loss,
+    mismatch_parts,
     surrogate,
     token_terms,
 )
@@ -235,6 +236,13 @@ def test_weights_and_dropped_rollouts_by_hand(options, loss, dropped):
     assert float(parts["dropped_share"][0]) == dropped
     assert float(parts["sampler_gap"][0]) == pytest.approx((np.log(2) + 2 * np.log(3) / 3) / 2, rel=1e-6)
     assert float(parts["sampler_gap_peak"][0]) == pytest.approx(np.log(3), rel=1e-6)
+
+
+def test_the_gap_of_the_sampler_is_that_of_rollouts_with_tokens():
+    """A rollout that was cut off and is masked has none: it must not hide the gap of the others."""
+    mask = jnp.array([[[True, True], [False, False]]])
+    found = mismatch_parts(jnp.full((1, 2, 2), 0.3), mask, jnp.zeros((1, 2), bool))
+    assert float(found["sampler_gap"][0]) == pytest.approx(0.3, rel=1e-6)
 
 
 @pytest.mark.parametrize(

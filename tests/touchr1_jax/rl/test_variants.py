@@ -243,6 +243,12 @@ def test_a_score_that_knows_no_rewards_cannot_credit_segments():
         make_grpo_step(FNS, score, OPTIMIZER, of(Paper(segment_credit=True)))
 
 
+def test_minibatches_are_refused_where_scores_are_centered():
+    """Whoever draws the rollouts: after the first optimizer step ratios are no longer 1."""
+    with pytest.raises(ValueError, match="minibatches is 2: must be 1 where score_centering is set"):
+        make_grpo_step(FNS, score, OPTIMIZER, of(Paper(score_centering=2, minibatches=2)))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("buckets", [(), (2, 4)])
 def test_without_a_reward_that_is_settled_early_segments_change_nothing(buckets):

@@ -64,7 +64,13 @@ def test_noise_has_the_mean_and_spread_of_the_recorded_frames():
 def test_noise_keeps_the_frame_times_of_the_contacts_and_no_frame_repeats():
     clip = touched(np.where(np.arange(8) % 2, 120, 80)[:, None], np.zeros(3))
     pixels, _, index, mask = bank(clip, 6)
-    rows = np.arange(6) % 4
-    assert np.array_equal(index, clip["frame_index"][rows])
-    assert np.array_equal(mask, clip["frame_mask"][rows])
+    rows, sensors = np.array([[0, 1, 2, 3, 0, 1], [1, 2, 3, 1, 2, 3]]).T, np.arange(2)
+    assert np.array_equal(index, clip["frame_index"][rows, sensors])
+    assert np.array_equal(mask, clip["frame_mask"][rows, sensors])
     assert len(np.unique(pixels[..., 0, 0])) == pixels[..., 0, 0].size
+
+
+def test_no_draw_has_the_frames_of_a_sensor_that_recorded_none():
+    """The encoder reads masked frames as nothing: such a draw would be no noise, but a blank."""
+    mask = bank(touched(np.full(8, 100)[:, None], np.zeros(3)), 8)[-1]
+    assert mask.any(-1).all()

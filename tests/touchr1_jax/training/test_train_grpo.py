@@ -63,3 +63,11 @@ def test_streams_are_checked_in_the_batch_of_all_processes_and_no_batch_is_used_
         check(Repeated(WHOLE), ManyProcesses(BLIND))
     with pytest.raises(ValueError, match="no prompt of the first batch has touch"):
         check(own, SingleDevice())
+
+
+def test_lean_compilation_is_refused_on_a_mesh_which_would_ignore_it():
+    devices = SingleDevice()
+    devices.shape = (2, 1, 1)
+    config = dataclasses.replace(CONFIG, lean_compilation=True)
+    with pytest.raises(ValueError, match=r"lean_compilation is True: must be False on a mesh of \(2, 1, 1\)"):
+        check_whole_batch(tiny.SHALLOW, {}, Repeated(WHOLE), config, Hooks(devices=devices), NOISE, 0)
