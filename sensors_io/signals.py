@@ -7,6 +7,8 @@ from types import FrameType
 ENDING = (signal.SIGTERM, signal.SIGHUP)
 """The signal of a scheduler, and that of a terminal or a connection that was closed."""
 
+AGAIN_S = 0.02  # until a signal that was lost comes again
+
 
 class Ended(KeyboardInterrupt):
     """One of `ENDING` came; all that handles Ctrl-C handles it."""
@@ -17,10 +19,17 @@ class Ended(KeyboardInterrupt):
 
 
 def end_as_interrupted() -> None:
-    """Raise `Ended` at the first of `ENDING`; a signal that is ignored, as under nohup, stays so."""
+    """Raise `Ended` at the first of `ENDING`; a signal that is ignored, as under nohup, stays so.
+
+    What is raised within a callback of the garbage collector, such as JAX's, Python only reports: it comes again.
+    """
     for number in ENDING:
         if signal.getsignal(number) is signal.SIG_DFL:
             signal.signal(number, _raise)
+    report = sys.unraisablehook
+    sys.unraisablehook = lambda lost: (
+        _again(lost.exc_value) if isinstance(lost.exc_value, KeyboardInterrupt) else report(lost)
+    )
 
 
 def leave_interrupted(error: KeyboardInterrupt, message: str) -> int:
@@ -49,3 +58,9 @@ def say(text: str) -> None:
 def _raise(number: int, frame: FrameType | None) -> None:
     del frame
     raise Ended(number)
+
+
+def _again(error: KeyboardInterrupt) -> None:
+    number = exit_status(error) - 128
+    signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(number))
+    signal.setitimer(signal.ITIMER_REAL, AGAIN_S)

@@ -78,6 +78,8 @@ class DemoHandler(http.server.BaseHTTPRequestHandler):
         if split.path != "/video" or not re.fullmatch("[0-9]{1,12}", length) or int(length) > MOST_BYTES:
             self.close_connection = True
             self._reply(f"a video of at most {MOST_BYTES // 2**20} MB is expected", status=413)
+            while self.rfile.read1(2**20):  # to close while it comes would reset the connection, and lose the answer
+                pass
             return
         video = self.rfile.read(int(length))
         if len(video) < int(length):

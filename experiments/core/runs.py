@@ -123,13 +123,16 @@ def point_latest(directory: Path) -> None:
 def locked(directory: Path) -> Iterator[None]:
     """Lock a run directory for this process, until it ends; `RunInUse` if another process has locked it."""
     with (directory / ".lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise RunInUse(
-                f"{directory} is in use by another process: two would overwrite each other; "
-                "wait for it, stop it, or start a new run with --fresh"
-            ) from None
+        while True:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if _in_use(directory):  # else somebody looks whether it is, and is done in a moment
+                    raise RunInUse(
+                        f"{directory} is in use by another process: two would overwrite each other; "
+                        "wait for it, stop it, or start a new run with --fresh"
+                    ) from None
         yield
 
 
@@ -249,7 +252,7 @@ def _object(path: Path, *lists: str) -> dict[str, Any]:
 
 
 def _in_use(directory: Path) -> bool:
-    """True if a process works in a run directory; while this checks, none can begin."""
+    """True if a process works in a run directory; one that begins waits until this has checked."""
     lock = directory / ".lock"
     if not lock.exists():
         return False

@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -98,14 +99,14 @@ def read_ratings(path: Path) -> dict[str, Float[np.ndarray, "A"]]:
 
 
 def videos_of(places: Sequence[Path]) -> list[Path]:
-    """The videos that are named, a folder standing for those in it; `ImportSourceError` where there is none."""
+    """The videos that are named, each once, a folder standing for its own; `ImportSourceError` where there is none."""
     files = []
     for place in places:
         inside = sorted(p for p in place.iterdir() if p.suffix.lower() in SUFFIXES) if place.is_dir() else [place]
         if not inside or not inside[0].is_file():
             raise ImportSourceError(f"predict is {place}: must be or hold videos ({', '.join(SUFFIXES)}); correct it")
         files += inside
-    return files
+    return list(dict.fromkeys(files))
 
 
 def describe_files(files: Sequence[Path], frames: int, context: Context) -> DescribedVideos:
@@ -128,14 +129,15 @@ def _describe_files(
                     reasons.append(str(error))
         return {"x": x, "reasons": np.array(reasons)}
 
-    sizes = [(str(p.resolve()), p.stat().st_size if p.is_file() else -1) for p in files]
-    cached = _cached(context, "descriptions", [VERSION, frames, families(), sizes], make)
+    states = [(str(p.resolve()), *_state(p)) for p in files]
+    cached = _cached(context, "descriptions", [VERSION, frames, families(), states], make)
     reasons = cached["reasons"]
     read = np.flatnonzero(reasons == "")
     if not len(read):
         raise ImportSourceError(f"{files[0].parent}: no video can be read, the first {reasons[0]}; check the folder")
     skipped = tuple(Skip(name=file.name, reason=str(why)) for file, why in zip(files, reasons, strict=True) if why)
-    names = np.array([p.name for p in files])
+    alike = Counter(p.name for p in files)  # in several folders
+    names = np.array([p.name if alike[p.name] == 1 else str(p) for p in files])
     return DescribedVideos(
         names=names[read],
         objects=objects[read],
@@ -144,6 +146,11 @@ def _describe_files(
         rating=np.full((len(read), label.shape[1]), np.nan),
         skipped=skipped,
     )
+
+
+def _state(file: Path) -> tuple[int, ...]:
+    """Size and time of a file, by which another in its place is told from it; nothing of one that is not there."""
+    return (file.stat().st_size, file.stat().st_mtime_ns) if file.is_file() else ()
 
 
 def auxiliary_data(config: SceneConfig, sets: int, every: DescribedVideos, context: Context) -> AuxiliaryData:

@@ -50,7 +50,7 @@ def prepare_records(config: SourceConfig, context: Context) -> Path:
     if config.data_dir is None:
         path = context.cache_dir / f"scenes-{config_hash(config.scenes)}"
         make = functools.partial(generate_records, config.scenes, path)
-        _make(context, "making scenes", lambda report: _after_others(lambda: make(progress=report), context))
+        _make(context, "making scenes", lambda report: make(progress=report))
         return path
     if config.data == "records":
         return config.data_dir
@@ -80,7 +80,7 @@ def odd_contacts(config: SourceConfig, path: Path, context: Context) -> tuple[in
     return tuple(sorted({i for rows in reasons.values() for i in rows}))
 
 
-def _after_others(make: Callable[[], None], context: Context) -> None:
+def _after_others(make: Callable[[], object], context: Context) -> object:
     """Make records, or wait for another run of a sweep that is making the same ones."""
     waits = False
     while True:
@@ -95,4 +95,4 @@ def _after_others(make: Callable[[], None], context: Context) -> None:
 
 def _make(context: Context, title: str, make: Callable[[ProgressCallback], object]) -> None:
     with context.timed("data"), context.progress_callback(title) as report:
-        context.processes.write_once(lambda: make(report))
+        context.processes.write_once(lambda: _after_others(lambda: make(report), context))

@@ -111,7 +111,10 @@ def calibrate(
     config = config or CalibrateConfig()
     _check_window(presses, config)
     _check_colours(presses, config)
-    bad = {i: reason for i in range(len(presses)) if (reason := _unusable(presses, i, config))}
+    first: dict[bytes, int] = {}  # a copy would be held out from a map that has seen it
+    copies = {i: first[key] for i, key in enumerate(presses.hashes()) if first.setdefault(key, i) != i}
+    bad = {i: f"is a copy of {names[of]}" for i, of in copies.items()}
+    bad |= {i: reason for i in range(len(presses)) if (reason := _unusable(presses, i, config))}
     good = _enough(presses, names, bad, config)
     circles = find_circles(presses.chosen(good))
     bad |= {int(good[i]): reason for i, reason in _misfits(presses.chosen(good), circles, config).items()}
@@ -119,6 +122,7 @@ def calibrate(
         circles = find_circles(presses.chosen(remaining))
     kept = presses.chosen(remaining)
     _check_size(kept, circles.touches, config)
+    config = dataclasses.replace(config, folds=min(config.folds, len(kept)))
     equations = prepare(kept, circles.touches, seed=config.seed, folds=config.folds)
     colours, choice = solve_map(equations.grams, seed=config.seed, folds=config.folds)
     fits = 1 + config.folds * config.repeats

@@ -8,6 +8,9 @@ import numpy as np
 
 from sensors_io.fields.types import CalibrationError
 
+MOST_SIDES = 3
+"""Radius of a ball in longer sides of the pictures; the contact of a larger one hardly fits into them."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BallPresses:
@@ -20,7 +23,8 @@ class BallPresses:
       mm_per_px: pitch of the pixels.
 
     Raises:
-      CalibrationError: arrays of another type or shape, a radius or a pitch that is not positive.
+      CalibrationError: arrays of another type or shape, a pitch that is not positive, a ball smaller than a pixel or
+        far larger than the pictures.
     """
 
     pictures: np.ndarray
@@ -39,6 +43,12 @@ class BallPresses:
         for name in ("radius_mm", "mm_per_px"):
             if not getattr(self, name) > 0:
                 raise CalibrationError(f"{name} is {getattr(self, name)}: must be > 0; measure it")
+        most_mm = MOST_SIDES * max(self.shape) * self.mm_per_px
+        if not self.mm_per_px <= self.radius_mm <= most_mm:
+            raise CalibrationError(
+                f"ball diameter is {2 * self.radius_mm:g} mm: must lie in [{2 * self.mm_per_px:g}, {2 * most_mm:g}] mm "
+                f"for pictures of {self.shape[1]} × {self.shape[0]} px at {self.mm_per_px:g} mm/px; give it in mm"
+            )
 
     def __len__(self) -> int:
         return len(self.pictures)
@@ -48,10 +58,13 @@ class BallPresses:
         """Rows and columns."""
         return self.background.shape[0], self.background.shape[1]
 
+    def hashes(self) -> list[bytes]:
+        """Of the pixels of each press."""
+        return [hashlib.sha256(np.ascontiguousarray(picture).tobytes()).digest() for picture in self.pictures]
+
     def canonical_order(self) -> np.ndarray:
         """Indices that sort the presses by the hash of their pixels: the same presses in any order come out alike."""
-        hashes = [hashlib.sha256(np.ascontiguousarray(picture).tobytes()).digest() for picture in self.pictures]
-        return np.array(sorted(range(len(hashes)), key=hashes.__getitem__), np.int64)
+        return np.array(sorted(range(len(self)), key=self.hashes().__getitem__), np.int64)
 
     def chosen(self, index: np.ndarray) -> "BallPresses":
         """Some of the presses."""

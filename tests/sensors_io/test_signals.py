@@ -1,6 +1,9 @@
 """Signals that end a program do what Ctrl-C does; one that is ignored stays so; a second one ends it at once."""
 
+import gc
 import signal
+import sys
+import time
 
 import pytest
 
@@ -12,9 +15,10 @@ ALL = (signal.SIGINT, *ENDING)
 
 
 @pytest.fixture(autouse=True)
-def handlers():
+def handlers(monkeypatch):
     """Handlers of a program that was just started, and afterwards those of the tests."""
-    before = {number: signal.getsignal(number) for number in ALL}
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
+    before = {number: signal.getsignal(number) for number in (*ALL, signal.SIGALRM)}
     for number in ALL:
         signal.signal(number, signal.SIG_DFL)
     yield
@@ -30,6 +34,26 @@ def test_a_signal_unwinds_the_program_as_ctrl_c_does(number, capsys):
     assert leave_interrupted(stopped.value, "run it again") == 128 + number
     assert capsys.readouterr().err == "run it again\n"
     assert {signal.getsignal(n) for n in ALL} == {signal.SIG_DFL}
+
+
+@pytest.mark.parametrize("number", ALL)
+def test_a_signal_within_a_callback_of_the_garbage_collector_is_not_lost(number):
+    """Python only reports what is raised there, and goes on; JAX has such a callback."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    end_as_interrupted()
+
+    def strike(phase, info):
+        gc.callbacks.remove(strike)
+        signal.raise_signal(number)
+
+    def collect():
+        gc.collect()
+        time.sleep(5)
+
+    gc.callbacks.append(strike)
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        collect()
+    assert leave_interrupted(stopped.value, "") == 128 + number
 
 
 def test_a_signal_that_is_ignored_stays_so():

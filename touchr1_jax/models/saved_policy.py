@@ -229,12 +229,13 @@ def fitting(folder: Path, flat: Mapping[str, np.ndarray], wanted: Params) -> Par
 def default_card(saved: SavedPolicy, precision: Precision) -> str:
     """A model card of the policy's sizes, inputs and notes."""
     size = sum(x.size for x in jax.tree.leaves(saved.params))
+    attributes = [attribute.name for attribute in saved.policy.language.attributes]
     rows: dict[str, object] = {
         "parameters": f"{size:,}, stored as {precision}",
         "sensors": ", ".join(saved.sensors),
         "frames of each sensor": f"{saved.model.frames} of {saved.model.image_px} × {saved.model.image_px} pixels",
         "force, picture of the object in training": f"{_yes(saved.reads.force)}, {_yes(saved.reads.view)}",
-        "questions": ", ".join(f"{q}? ({', '.join(words(saved, a))})" for a, q in saved.questions.items()),
+        "questions": ", ".join(f"{saved.questions[a]}? ({', '.join(words(saved, a))})" for a in attributes),
         **{name: value for name, value in saved.notes.items() if not isinstance(value, Mapping)},
     }
     table = "\n".join(f"| {name} | {value} |" for name, value in rows.items())
@@ -355,10 +356,11 @@ def _read_params(folder: Path) -> dict[str, np.ndarray]:
     """Parameters in float32, by dotted names."""
     try:
         found = {name: read_tensor(entry) for name, entry in read_header(folder / SINGLE).items()}
-        params = {name: x.astype(np.float32) for name, x in found.items() if not name.endswith(SCALE)}
-        return restacked({name: x * found.get(name + SCALE, np.float32(1)) for name, x in params.items()})
+        params = {name: x for name, x in found.items() if not name.endswith(SCALE)}
+        scale = {name: found[name + SCALE] if x.dtype == np.int8 else np.float32(1) for name, x in params.items()}
+        return restacked({name: x.astype(np.float32) * scale[name] for name, x in params.items()})
     except (ValueError, LookupError) as error:
-        raise PolicyError(f"policy is {folder}: {error}") from error
+        raise PolicyError(f"policy is {folder}: {SINGLE} does not fit this version ({error}); save it anew") from error
 
 
 def rebuilt(kind: Any, value: Any) -> Any:

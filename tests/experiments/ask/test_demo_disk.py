@@ -1,4 +1,4 @@
-"""The page of the demo where the machine has no room left: every request gets an answer."""
+"""The page of the demo, and a video for which there is no room: every request gets an answer."""
 
 import errno
 import tempfile
@@ -42,3 +42,10 @@ def test_a_video_that_finds_no_room_is_answered(address, monkeypatch):
         "the video could not be kept ([Errno 28] No space left on device): free some space in TMPDIR of the program"
     )
     assert post(address, b"abcd") == (200, "4 bytes")
+
+
+def test_who_sends_too_large_a_video_is_told(address, monkeypatch):
+    """The answer must not be lost with a connection that is closed while the video still comes."""
+    monkeypatch.setattr(demo, "MOST_BYTES", 2**20)
+    assert post(address, bytes(2**24)) == (413, "a video of at most 1 MB is expected")
+    assert post(address, b"abc") == (200, "3 bytes")

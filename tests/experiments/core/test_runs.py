@@ -1,8 +1,10 @@
 """Run directories, the revision of the code, and past runs as `list` shows them."""
 
+import fcntl
 import json
 import subprocess
 import sys
+import threading
 
 import pytest
 
@@ -87,6 +89,17 @@ def test_the_list_of_one_experiment_shows_every_run_and_how_to_continue(tmp_path
     assert "      Really." in lines
     assert f"      to continue: {COMMAND}" in lines
     assert lines[-1].endswith("running")
+
+
+def test_who_looks_at_a_run_does_not_keep_it_from_going_on(tmp_path):
+    """`list`, `compare` and a sweep's page lock each run for the moment in which they see whether it is in use."""
+    with (tmp_path / ".lock").open("w") as looking:
+        fcntl.flock(looking, fcntl.LOCK_SH)
+        threading.Timer(0.1, looking.close).start()
+        with runs.locked(tmp_path):
+            assert looking.closed
+            with pytest.raises(runs.RunInUse, match="is in use by another process"), runs.locked(tmp_path):
+                pass
 
 
 def test_a_damaged_run_hides_no_other(tmp_path, capsys):

@@ -1,6 +1,7 @@
 """Where data comes from: refused combinations, caches named after what made them."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from experiments.study import sources
 from experiments.study.dataset import split_parts
 from experiments.study.sources import SourceConfig, odd_contacts, prepare_records
 from sensors_io.importers.physiclear import PhysiclearConfig
-from sensors_io.records import RecordWriter
+from sensors_io.records import RecordsBusyError, RecordWriter
 from sensors_io.scenes.config import SceneConfig, config_hash
 from tests.experiments import tiny
 
@@ -55,6 +56,23 @@ def test_other_scenes_lie_elsewhere(monkeypatch, context):
         made_at = prepare_records(dataclasses.replace(GENERATED, scenes=scenes), context)
         assert made[-1] == made_at
     assert len(set(made)) == 3
+
+
+@pytest.mark.parametrize(
+    ("maker", "change"),
+    [("generate_records", {}), ("import_physiclear", {"data": "physiclear", "data_dir": Path("videos")})],
+)
+def test_records_that_another_run_is_making_are_waited_for(monkeypatch, context, console, maker, change):
+    busy = [RecordsBusyError("records are being written"), RecordsBusyError("records are being written")]
+
+    def make(*args, **options):
+        if busy:
+            raise busy.pop()
+
+    monkeypatch.setattr(sources, maker, make)
+    monkeypatch.setattr(sources.time, "sleep", lambda seconds: None)
+    prepare_records(dataclasses.replace(GENERATED, **change), context)
+    assert console.file.getvalue().count("waiting: records are being written") == 1
 
 
 def test_imported_videos_are_named_by_folder_and_settings(tmp_path, context, console, imported):

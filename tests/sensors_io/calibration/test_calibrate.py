@@ -105,9 +105,23 @@ def test_presses_that_cannot_calibrate_are_refused(presses: BallPresses) -> None
         (r"0 of 10 presses can be used[\s\S]*press 3 shows no contact", {"pictures": blank}),
         ("change alike.*maker's table", {"pictures": grey}),
         ("5 of 5 presses can be used: must be ≥ 8", {"pictures": presses.pictures[:5]}),
+        (r"1 of 10 presses[\s\S]*press 9 is a copy of press 0", {"pictures": presses.pictures[[0] * 10]}),
     ):
         wrong = dataclasses.replace(presses, **change)
         refused(CalibrationError, said, calibrate, wrong, names(wrong), "x", QUICK)
+
+
+@pytest.mark.long
+def test_pictures_that_are_given_twice_count_once(presses: BallPresses) -> None:
+    """A copy in another fold would be held out from nothing; more folds than presses are as many as presses."""
+    twice = presses.chosen(np.arange(24) % 12)
+    config = dataclasses.replace(QUICK, folds=20)
+    done = []
+    made, report = calibrate(twice, names(twice), "x", config, lambda *at: done.append(at))
+    alone, other = calibrate(presses, names(presses), "x", dataclasses.replace(QUICK, folds=12))
+    assert (made.hash, len(report.kept), report.left_out[0].reason) == (alone.hash, 12, "is a copy of press 0")
+    np.testing.assert_array_equal(report.errors.depth_um, other.errors.depth_um)
+    assert done[-1] == (13, 13)
 
 
 @pytest.mark.slow

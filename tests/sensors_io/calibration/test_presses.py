@@ -58,6 +58,8 @@ def test_shrinking_takes_means() -> None:
     [
         ({"radius_mm": 0.0}, "radius_mm is 0.0: must be > 0"),
         ({"mm_per_px": -1.0}, r"mm_per_px is -1.0: must be > 0"),
+        ({"radius_mm": 3000.0}, r"diameter is 6000 mm: must lie in \[0.3, 95.4\] mm for pictures of 106 × 80 px"),
+        ({"radius_mm": 0.003}, "diameter is 0.006 mm: must lie in .*; give it in mm"),
         ({"background": np.zeros((80, 100, 3), np.uint8)}, "must be equal"),
         ({"pictures": np.zeros((2, 80, 106, 3), np.float32)}, "must be uint8"),
     ],

@@ -14,6 +14,7 @@ from experiments.faults.trainings.small_study import MODEL
 from tests.touchr1_jax.drawn import draw_params
 from touchr1_jax.asking import load_policy
 from touchr1_jax.models import saved_policy
+from touchr1_jax.models.qwen.safetensors import read_header, read_tensor, write_file
 from touchr1_jax.models.saved_policy import PolicyError, PolicyInput, SavedPolicy, published, read_policy, save_policy
 from touchr1_jax.models.touch_policy import build_policy, touch_shapes
 from touchr1_jax.text.tokenizer import word_tokenizer
@@ -229,6 +230,25 @@ def test_parameters_that_are_not_finite_are_refused(saved, tmp_path):
     save_policy(tmp_path / "p", dataclasses.replace(saved, params=diverged))
     with pytest.raises(PolicyError, match="hold numbers that are not finite: its training diverged"):
         read_policy(tmp_path / "p")
+
+
+def test_whole_numbers_are_no_weights_without_their_steps(saved, tmp_path):
+    save_policy(tmp_path / "p", saved, precision="int8")
+    weights = tmp_path / "p" / "model.safetensors"
+    tensors = {name: read_tensor(entry) for name, entry in read_header(weights).items()}
+    write_file(weights, {name: x for name, x in tensors.items() if not name.endswith(":step")})
+    digest = hashlib.sha256(weights.read_bytes()).hexdigest()
+    sign(tmp_path / "p", lambda c: c["files"].update({weights.name: digest}))
+    with pytest.raises(PolicyError, match=r"model\.safetensors does not fit this version .*:step"):
+        read_policy(tmp_path / "p")
+
+
+def test_a_card_tells_the_questions_of_the_language_alone(saved, tmp_path):
+    more = dataclasses.replace(saved, questions={**saved.questions, "colour": "what colour is it"})
+    save_policy(tmp_path / "p", more)
+    card = (tmp_path / "p" / "README.md").read_text()
+    assert "how hard is it? (soft, firm, hard)" in card
+    assert "colour" not in card
 
 
 def flip(path):

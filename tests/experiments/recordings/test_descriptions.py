@@ -1,0 +1,39 @@
+"""Descriptions of videos: each of its own file, and of what the file holds now."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.recordings import descriptions
+from experiments.recordings.descriptions import describe_files, families, videos_of
+
+
+@pytest.fixture
+def described(monkeypatch, context):
+    """Describes videos by the number that each file holds."""
+    monkeypatch.setattr(descriptions, "read_touch", lambda file, frames: float(file.read_text()))
+    monkeypatch.setattr(descriptions, "describe", lambda touch: np.full(len(families()), touch, np.float32))
+    return lambda files: describe_files(files, 8, context)
+
+
+def write(path: Path, text: str) -> Path:
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+def test_videos_of_one_name_are_told_apart_and_one_that_is_named_twice_counts_once(described, tmp_path):
+    files = [write(tmp_path / folder / "press.mov", number) for folder, number in (("a", "1"), ("b", "2"))]
+    other = write(tmp_path / "b" / "other.mov", "3")
+    found = described(videos_of([*files, tmp_path / "b"]))
+    assert found.names.tolist() == [str(files[0]), str(files[1]), other.name]
+    assert found.x[:, 0].tolist() == [1, 2, 3]
+
+
+def test_a_video_that_was_recorded_anew_is_described_anew(described, tmp_path):
+    file = write(tmp_path / "press.mov", "1")
+    assert described([file]).x[0, 0] == 1
+    os.utime(write(file, "2"), ns=(0, 10**18))  # of the same size
+    assert described([file]).x[0, 0] == 2
