@@ -111,10 +111,7 @@ def calibrate(
     config = config or CalibrateConfig()
     _check_window(presses, config)
     _check_colours(presses, config)
-    first: dict[bytes, int] = {}  # a copy would be held out from a map that has seen it
-    copies = {i: first[key] for i, key in enumerate(presses.hashes()) if first.setdefault(key, i) != i}
-    bad = {i: f"is a copy of {names[of]}" for i, of in copies.items()}
-    bad |= {i: reason for i in range(len(presses)) if (reason := _unusable(presses, i, config))}
+    bad = _copies(presses, names) | {i: why for i in range(len(presses)) if (why := _unusable(presses, i, config))}
     good = _enough(presses, names, bad, config)
     circles = find_circles(presses.chosen(good))
     bad |= {int(good[i]): reason for i, reason in _misfits(presses.chosen(good), circles, config).items()}
@@ -125,8 +122,7 @@ def calibrate(
     config = dataclasses.replace(config, folds=min(config.folds, len(kept)))
     equations = prepare(kept, circles.touches, seed=config.seed, folds=config.folds)
     colours, choice = solve_map(equations.grams, seed=config.seed, folds=config.folds)
-    fits = 1 + config.folds * config.repeats
-    progress(1, fits)
+    progress(1, fits := 1 + config.folds * config.repeats)
     errors = cross_validate(
         kept,
         sensor,
@@ -151,6 +147,13 @@ def calibrate(
         sensor=sensor, background=presses.background, mm_per_px=presses.mm_per_px, colours=colours, made_from=made_from
     )
     return made, report
+
+
+def _copies(presses: BallPresses, names: tuple[str, ...]) -> dict[int, str]:
+    """Presses that are there already: a copy would be held out from a map that has seen it."""
+    first: dict[bytes, int] = {}
+    copies = {i: first[key] for i, key in enumerate(presses.hashes()) if first.setdefault(key, i) != i}
+    return {i: f"is a copy of {names[of]}" for i, of in copies.items()}
 
 
 def _unusable(presses: BallPresses, i: int, config: CalibrateConfig) -> str:
