@@ -15,7 +15,7 @@ from touchr1_jax.types import Params
 from touchr1_jax.validation import above, at_least, within
 
 KLEstimator = Literal["k1", "k2", "k3", "exact"]
-"""Estimators of the KL to the reference (see `losses.estimated_kl`)."""
+"""Estimators of the KL to the reference (see `losses.estimated_kl`); under top-p or min-p `exact` alone is unbiased."""
 
 
 class Surrogate(enum.Enum):

@@ -68,7 +68,7 @@ def grpo_loss(
         S_t = min(ρ_t A, clip(ρ_t, 1 − low, 1 + high) A),   ρ_t = π(o_t) / π_old(o_t)     (`surrogate` has others)
         c_t = min(π_old(o_t) / π_sampler(o_t), cap)                       (`importance` has another)
 
-    ⟨·⟩ is the mean over the tokens of a prompt's group: `algorithm.average` for S and KL, per rollout for G and H.
+    ⟨·⟩ is the mean over the tokens of a group: `algorithm.average` for S and KL, per rollout for G, per kept one for H.
     Source: Touch-R1 (arXiv 2605.27154, eq. 5), where N = P, w = 1/N, c = 1, η = λ = 0 and nothing bounds G.
 
     Args:
@@ -92,8 +92,8 @@ def grpo_loss(
     drawn, mask = mask, mask & ~dropped[..., None]
     objective, clipped, expected = policy_objective(algorithm, terms, old, sampler, mask, advantage, levels, head)
     policy, kl = (group_mean(algorithm.average, x, mask, longest) for x in (objective, terms.reference_kl))
-    per_rollout = lambda x: group_mean(Average.ROLLOUT, x, mask, longest)
-    grounding, entropy = per_rollout(terms.grounding), per_rollout(terms.entropy)
+    grounding = group_mean(Average.ROLLOUT, terms.grounding, mask, longest)
+    entropy = masked.mean(masked.mean(terms.entropy, mask, -1), jnp.any(mask, -1), -1)
     grounded = at_most(algorithm.gamma * grounding, algorithm.grounding_budget)
     explored = algorithm.entropy_weight * at_most(entropy, algorithm.entropy_floor_nat)
     further = grounded - loss_beta(algorithm) * kl + explored + (0.0 if answer is None else algorithm.anchor * answer)
@@ -106,7 +106,7 @@ def grpo_loss(
         "grounding": grounding,
         "grounding_peak": peak(terms.grounding),
         "entropy": entropy,
-        "clip_share": per_rollout(clipped.astype(jnp.float32)),
+        "clip_share": group_mean(Average.ROLLOUT, clipped.astype(jnp.float32), mask, longest),
         **mismatch_parts(jax.lax.stop_gradient(terms.log_prob) - sampler, drawn, dropped),
     }
 

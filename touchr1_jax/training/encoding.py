@@ -68,7 +68,7 @@ def noise_bank(
     frames, force_n = np.asarray(batch.frames), np.asarray(batch.force_n)
     pixel = _statistics(frames.astype(np.float32) * recorded[..., None, None, None], (0, 2, 3, 4))
     force = _statistics(force_n * recorded[..., None], (0, 2))
-    there = np.asarray(batch.frame_mask).any(-1).T
+    there = np.any(batch.frame_mask, -1).T
     rows = np.stack([np.resize(np.flatnonzero(x) if x.any() else np.arange(len(x)), draws) for x in there], 1)
     keys = jax.random.split(jax.random.key(seed), draws)
     times = (jnp.asarray(np.take_along_axis(x, rows[..., None], 0)) for x in (batch.frame_index, batch.frame_mask))

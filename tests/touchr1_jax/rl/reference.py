@@ -206,7 +206,8 @@ def objective(config, own, perturbed, fixed, *, first: bool) -> float:
     gain = (fixed["weight"] * average(policy)).sum()
     beta = 0.0 if a.kl_in_reward else a.beta
     grounded = np.minimum(a.gamma * per_rollout(grounding), a.grounding_budget or np.inf)
-    entropy = np.minimum(per_rollout(-(p * log_p).sum(-1)), a.entropy_floor_nat or np.inf)
+    of_kept = per_rollout(-(p * log_p).sum(-1)) / np.maximum(mask.any(-1).mean(-1), 1e-9)
+    entropy = np.minimum(of_kept, a.entropy_floor_nat or np.inf)
     likelihood = of_tokens(log_softmax(own[:, 0]), fixed["answer"]).mean(-1)
     further = grounded - beta * average(kl[a.kl]) + a.entropy_weight * entropy + a.anchor * likelihood
     return -(gain + further.sum() / config.prompts)

@@ -245,6 +245,21 @@ def test_the_gap_of_the_sampler_is_that_of_rollouts_with_tokens():
     assert float(found["sampler_gap"][0]) == pytest.approx(0.3, rel=1e-6)
 
 
+def test_the_entropy_is_that_of_rollouts_with_tokens():
+    """One rollout of .8 nat beside a masked one is above a floor of .5, and gets no more bonus."""
+    nothing, mask = jnp.zeros((1, 2, 1)), jnp.array([[[True], [False]]])
+    algorithm = Paper(beta=0.0, gamma=0.0, mask_truncated=True, entropy_weight=1.0, entropy_floor_nat=0.5)
+    config = GRPOConfig(prompts=1, micro_prompts=1, group=2, length=1, algorithm=algorithm)
+
+    def loss(x):
+        terms = TokenTerms(nothing, nothing, nothing, x)
+        return grpo_loss(terms, nothing, nothing, mask, jnp.zeros((1, 2)), jnp.ones(1), config)
+
+    (_, parts), slopes = jax.value_and_grad(loss, has_aux=True)(jnp.full((1, 2, 1), 0.8))
+    assert float(parts["entropy"][0]) == pytest.approx(0.8)
+    assert not slopes.any()
+
+
 @pytest.mark.parametrize(
     ("cap", "slopes"), [(None, [0.1, -0.1]), (2.0, [0.0, 0.0]), (1.0, [0.0, -0.1])], ids=["no cap", "2", "1"]
 )
