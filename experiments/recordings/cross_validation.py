@@ -211,13 +211,14 @@ def pool(log_prob: Float[np.ndarray, "n 27"], objects: np.ndarray) -> Float[np.n
     return joint_log_prob(p, sharpness=1.0)
 
 
-def confidence(log_prob: Float[np.ndarray, "n 27"]) -> Float[np.ndarray, "n"]:
-    """Minus the expected distance of the answer from the truth, levels: the surest answers have the greatest.
+def confidence(answer: Int[np.ndarray, "n A"], evidence: Float[np.ndarray, "n 27"]) -> Float[np.ndarray, "n"]:
+    """Minus the expected distance of answers from the truth, levels: the surest have the greatest.
 
-    Of probabilities without the power of `joint_log_prob`, which is near 1 for every level that is ahead.
+    By the evidence without its power: sharpened, it is near 1 for every level that is ahead, and so is a policy that
+    read it.
     """
-    p = marginals(log_prob) ** (1 / SHARPNESS)
-    distance = np.abs(np.arange(LEVELS) - choose(log_prob)[..., None])
+    p = marginals(evidence) ** (1 / SHARPNESS)
+    distance = np.abs(np.arange(LEVELS) - answer[..., None])
     return -(p / p.sum(-1, keepdims=True) * distance).sum(-1).mean(-1)
 
 

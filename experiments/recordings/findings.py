@@ -36,9 +36,10 @@ BINS = (0.0, 0.2, 0.35, 0.5, 0.65, 0.8, 1.001)  # of stated probabilities
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class JudgedAnswers:
-    """Log-probabilities of the answers to the same n videos on P partitions, and the truth."""
+    """Log-probabilities of the answers to the same n videos on P partitions, of the evidence read, and the truth."""
 
     log_prob: Float[np.ndarray, "P n 27"]
+    evidence: Float[np.ndarray, "P n 27"]
     label: Int[np.ndarray, "n A"]
     objects: np.ndarray
 
@@ -60,7 +61,8 @@ class JudgedAnswers:
     def surest(self, share: float) -> np.ndarray:
         """Mask [m] of the share of videos of every partition that it is surest of."""
         count = max(1, round(share * len(self.label)))
-        order = np.argsort(-np.array([confidence(rows) for rows in self.log_prob]), 1, kind="stable")
+        sure = [confidence(choose(p), read) for p, read in zip(self.log_prob, self.evidence, strict=True)]
+        order = np.argsort(-np.array(sure), 1, kind="stable")
         mask = np.zeros(order.shape, bool)
         np.put_along_axis(mask, order[:, :count], True, 1)
         return mask.ravel()

@@ -155,13 +155,16 @@ def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Resul
         config=config.learn, videos=videos, auxiliary=auxiliary, fold=fold(seed), seed=seed, context=context
     )
     blind, elsewhere = [split(seed) for seed in config.seeds], split(DEVELOPMENT)
-    gather = lambda rows: findings.JudgedAnswers(log_prob=np.array(rows), label=videos.label, objects=videos.objects)
+    evidence = np.array([one.probes() for one in blind])
+    gather = lambda rows: findings.JudgedAnswers(
+        log_prob=np.array(rows), evidence=evidence, label=videos.label, objects=videos.objects
+    )
     policy = gather([one.policy(config.learn, "fold") for one in blind])
     pooled = gather([pool(rows, videos.objects) for rows in policy.log_prob])
     spent = training_time(context.timing(), config.seeds[0])
     train_policy(config, videos, auxiliary, context)
     regression = gather([logistic(videos, one.fold) for one in blind])
-    probes = gather([one.probes() for one in blind])
+    probes = gather(evidence)
     together = gather([pool(rows, videos.objects) for rows in regression.log_prob])
     blank = [constants(videos.label, videos.objects, one.fold) for one in blind]
     methods = {

@@ -92,8 +92,7 @@ def grpo_loss(
     drawn, mask = mask, mask & ~dropped[..., None]
     objective, clipped, expected = policy_objective(algorithm, terms, old, sampler, mask, advantage, levels, head)
     policy, kl = (group_mean(algorithm.average, x, mask, longest) for x in (objective, terms.reference_kl))
-    per_rollout = lambda x: group_mean(Average.ROLLOUT, x, mask, longest)
-    grounding = per_rollout(terms.grounding)
+    grounding = group_mean(Average.ROLLOUT, terms.grounding, mask, longest)
     entropy = masked.mean(masked.mean(terms.entropy, mask, -1), jnp.any(mask, -1), -1)
     grounded = at_most(algorithm.gamma * grounding, algorithm.grounding_budget)
     explored = algorithm.entropy_weight * at_most(entropy, algorithm.entropy_floor_nat)
@@ -107,7 +106,7 @@ def grpo_loss(
         "grounding": grounding,
         "grounding_peak": peak(terms.grounding),
         "entropy": entropy,
-        "clip_share": per_rollout(clipped.astype(jnp.float32)),
+        "clip_share": group_mean(Average.ROLLOUT, clipped.astype(jnp.float32), mask, longest),
         **mismatch_parts(jax.lax.stop_gradient(terms.log_prob) - sampler, drawn, dropped),
     }
 

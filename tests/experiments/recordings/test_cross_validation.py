@@ -73,9 +73,10 @@ def test_the_surest_answers_are_those_of_the_least_expected_distance():
     p = np.full((4, 3, 3), 1 / 3)
     p[1], p[3] = (0.98, 0.01, 0.01), (0.01, 0.01, 0.98)
     log_prob = joint_log_prob(p)
-    np.testing.assert_allclose(confidence(log_prob), [-2 / 3, -0.03, -2 / 3, -0.03])
+    np.testing.assert_allclose(confidence(choose(log_prob), log_prob), [-2 / 3, -0.03, -2 / 3, -0.03])
     label = np.array([[1, 1, 1], [0, 0, 0], [1, 1, 1], [2, 2, 0]])
-    answers = JudgedAnswers(log_prob=np.stack([log_prob] * 2), label=label, objects=np.array(["a", "b", "a", "b"]))
+    rows = {name: np.stack([log_prob] * 2) for name in ("log_prob", "evidence")}
+    answers = JudgedAnswers(**rows, label=label, objects=np.array(["a", "b", "a", "b"]))
     assert answers.surest(0.5).tolist() == [False, True, False, True] * 2
     same = gains(answers, answers)["mean"]
     assert (same.mean, same.low, same.high) == (0, 0, 0)
