@@ -114,6 +114,10 @@ class Panel:
     """Which x and which y are better; points with markers that another one dominates are crossed."""
 
 
+ROWS, ROW_IN = 3, 0.18
+"""Rows of a legend for which figures have room, and the height of each further one, inches."""
+
+
 def draw(
     panels: Sequence[Panel],
     *,
@@ -125,7 +129,8 @@ def draw(
 ) -> bytes:
     """Draw the panels in rows of `columns`, with one legend of the named series and rules above them, as SVG.
 
-    The `size` is in inches and by default grows with panels and rows; all panels may share an axis.
+    The `size` is in inches and by default grows with panels and rows; a long legend adds to its height.  All panels may
+    share an axis.
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure
@@ -142,8 +147,10 @@ def draw(
             axes.set_visible(False)
         entries = _entries(panels) if legend else {}
         if entries:
-            wide = int(figure.get_figwidth() * LETTERS) // (max(map(len, entries)) + 6)
-            figure.legend(list(entries.values()), list(entries), loc="outside upper left", ncols=max(1, wide))
+            wide = max(1, int(figure.get_figwidth() * LETTERS) // (max(map(len, entries)) + 6))
+            more = math.ceil(len(entries) / wide) - ROWS
+            figure.set_figheight(figure.get_figheight() + ROW_IN * max(0, more))
+            figure.legend(list(entries.values()), list(entries), loc="outside upper left", ncols=wide)
         if any(series.labels for panel in panels for series in panel.series):
             figure.draw_without_rendering()  # settles the layout, which ignores labels
             figure.set_layout_engine("none")

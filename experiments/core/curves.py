@@ -139,14 +139,14 @@ def accuracy_against_middle(
     mark: Mapping[str, Mark],
 ) -> bytes | None:
     """Draw accuracy over the rate of middle answers: a small dot per seed, a large mean; `None` if not measured."""
-    series, size = [], (6.6, 3.2 + 0.09 * len({**arms, **baselines}))  # with room for the legend
+    series = []
     for name, row in arms.items():
         own = mark.get(name, Mark(SHARED))
         series += _point(name, row, own.colour, own.marker)
     for (name, row), marker in zip(baselines.items(), itertools.cycle(MARKERS[1:]), strict=False):
         series += _point(name, row, SHARED, marker)
     x_label, y_label = f"{METRICS['middle_rate'].meaning} (%)", f"{METRICS['acc'].title} (%)"
-    return draw([Panel(series, x_label=x_label, y_label=y_label)], size=size) if series else None
+    return draw([Panel(series, x_label=x_label, y_label=y_label)], size=(6.6, 3.2)) if series else None
 
 
 def _point(name: str, row: Mapping[str, Estimate], colour: str, marker: str) -> list[Series]:
