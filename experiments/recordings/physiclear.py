@@ -164,13 +164,12 @@ def validate(config: PhysiclearStudy, data_dir: Path, context: Context) -> Resul
     spent = training_time(context.timing(), config.seeds[0])
     train_policy(config, videos, auxiliary, context)
     regression = gather([logistic(videos, one.fold) for one in blind])
-    probes = gather(evidence)
     together = gather([pool(rows, videos.objects) for rows in regression.log_prob])
     blank = [constants(videos.label, videos.objects, one.fold) for one in blind]
     methods = {
         "policy, one video": policy.levels,
         "policy, all videos of the object": pooled.levels,
-        "probes alone, one video": probes.levels,
+        "probes alone, one video": gather(evidence).levels,
         "logistic regression on hand features, one video": regression.levels,
         "logistic regression, all videos of the object": together.levels,
         **{name: np.concatenate([one[name] for one in blank]) for name in blank[0]},

@@ -69,7 +69,7 @@ def test_a_recorded_run_is_shown_as_its_report(tmp_path, capsys):
     assert "Scores on unseen objects" in page
     assert run_command(["show", "conflcit", "--runs-dir", str(tmp_path)], "experiments") == 2
     assert "Did you mean conflict?" in capsys.readouterr().err
-    assert run_command(["show", "few_labels", "--runs-dir", str(tmp_path)], "experiments") == 1
+    assert run_command(["show", "touch_r1", "--runs-dir", str(tmp_path)], "experiments") == 1
     assert "choose from ablation_cumulative" in capsys.readouterr().err
 
 
