@@ -11,8 +11,8 @@ level given people's ratings of the object (training objects only).  The saved p
 `--predict` answers with it, in words with probabilities: each video of a folder separately, several named videos also
 together, as touches of one object.
 
-Under a load of 15 on two cores: 30 minutes for scenes, once, 15 for the rest (`smoke` half a minute).  Expected: from
-one video, all three levels right for 45 % of the videos, 73 % of the levels right, OMAE .31; from all videos of an
+On one core of a busy machine: half an hour for scenes, once, 6 minutes for the rest (`smoke` half a minute).  Expected:
+from one video, all three levels right for 45 % of the videos, 73 % of the levels right, OMAE .31; from all videos of an
 object 51 %, 77 % and .26.  People agree with 75 to 79 % of the labels that they rated.
 """
 
