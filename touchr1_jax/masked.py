@@ -29,6 +29,11 @@ def mean(x: Shaped[AnyArray, "*n"], mask: Bool[AnyArray, "*m"], axis: Axis = Non
     return total(x, mask, axis, keepdims=keepdims) / jnp.maximum(size, 1)
 
 
+def mean_of_means(x: Shaped[AnyArray, "*n G T"], mask: Bool[AnyArray, "*n G T"]) -> Array:
+    """Mean of the rows' means, of the rows of which an element is selected."""
+    return mean(mean(x, mask, -1), jnp.any(mask, -1), -1)
+
+
 def var(
     x: Shaped[AnyArray, "*n"], mask: Bool[AnyArray, "*m"], axis: Axis = None, *, ddof: int = 0, keepdims: bool = False
 ) -> Array:

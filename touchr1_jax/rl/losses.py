@@ -93,7 +93,7 @@ def grpo_loss(
     objective, clipped, expected = policy_objective(algorithm, terms, old, sampler, mask, advantage, levels, head)
     policy, kl = (group_mean(algorithm.average, x, mask, longest) for x in (objective, terms.reference_kl))
     grounding = group_mean(Average.ROLLOUT, terms.grounding, mask, longest)
-    entropy = masked.mean(masked.mean(terms.entropy, mask, -1), jnp.any(mask, -1), -1)
+    entropy = masked.mean_of_means(terms.entropy, mask)
     grounded = at_most(algorithm.gamma * grounding, algorithm.grounding_budget)
     explored = algorithm.entropy_weight * at_most(entropy, algorithm.entropy_floor_nat)
     further = grounded - loss_beta(algorithm) * kl + explored + (0.0 if answer is None else algorithm.anchor * answer)
@@ -191,7 +191,7 @@ def mismatch_parts(
 ) -> dict[str, Float[Array, "P"]]:
     """Mean and largest |gap| of the drawn tokens of each prompt that count, and its share of dropped rollouts."""
     return {
-        "sampler_gap": masked.mean(masked.mean(jnp.abs(gap), mask, -1), jnp.any(mask, -1), -1),
+        "sampler_gap": masked.mean_of_means(jnp.abs(gap), mask),
         "sampler_gap_peak": jnp.max(jnp.where(mask, jnp.abs(gap), 0.0), (-2, -1)),
         "dropped_share": jnp.mean(dropped, -1),
     }
