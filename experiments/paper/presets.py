@@ -39,7 +39,6 @@ from touchr1_jax.training.train_encoder import EncoderTrainingConfig
 BENCH = StudyConfig(
     encoders=EncoderTrainingConfig(),
     decoder=dataclasses.replace(DECODER, steps=1200, save_every=300),
-    blind=StudySFT(steps=1350, micro_contacts=16),
     grpo_steps=200,
 )
 """The default: longer phases of the encoders and the decoder than in `ablation_ordinal`, whose score on validation
@@ -77,7 +76,6 @@ def _study(
     return StudyConfig(
         encoders=EncoderTrainingConfig(steps=0),  # SFT end to end trains them
         sft=sft,
-        blind=sft,
         decoder=decoder,
         grpo=grpo,
         grpo_steps=steps[1],

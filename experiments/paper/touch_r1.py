@@ -153,7 +153,6 @@ class TouchR1Config(TrainingConfig):
     encoders: EncoderTrainingConfig = EncoderTrainingConfig(steps=0)
     """None: what a released decoder reads is learned end to end, with its adapters."""
     sft: StudySFT = adapted_sft(1_500, micro_contacts=4)
-    blind: StudySFT = adapted_sft(1_500, micro_contacts=16)
     decoder: SFTConfig = adapted_sft(1_000, batch_size=16, questions=4, micro_contacts=4)
     grpo: GRPOConfig = GRPO
     grpo_steps: int = 1_000
@@ -331,7 +330,6 @@ SMOKE = dataclasses.replace(
         view_px=32,
     ),
     sft=adapted_sft(8, batch_size=4, micro_contacts=2),
-    blind=adapted_sft(8, batch_size=4, micro_contacts=4),
     decoder=adapted_sft(4, batch_size=4, micro_contacts=4),
     grpo=dataclasses.replace(GRPO, prompts=2, group=4, micro_prompts=1, length=48),
     grpo_steps=4,
@@ -357,7 +355,6 @@ SMALL = dataclasses.replace(
     clip_memory_gib=1.5,
     model=ReleasedModel(tactile=TactileViTConfig(sensors=0), frames=4, image_px=112, completion_tokens=36, view_px=32),
     sft=adapted_sft(1_000, batch_size=16, micro_contacts=2, lr_scale=100.0),
-    blind=adapted_sft(1_000, batch_size=16, micro_contacts=16, lr_scale=100.0),
     decoder=adapted_sft(300, batch_size=16, questions=4, micro_contacts=4, lr_scale=100.0),
     grpo=dataclasses.replace(GRPO, prompts=8, micro_prompts=4, length=36, lr_scale=200.0),
     grpo_steps=150,

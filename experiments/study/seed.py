@@ -129,8 +129,12 @@ class StudySeed:
         return self._shared("sft", stage, train, values, {"rows": rows, "start": start})
 
     def run_sft(self, config: StudySFT, stage: str, start: Mapping[str, Any] = {}, *, blind: bool = False) -> Params:
-        """SFT end to end of fresh parameters, in which those of `start` take their places; blind is without touch."""
+        """SFT end to end of fresh parameters, in which those of `start` take their places.
+
+        `blind` is the control without touch, under recipe `touch` up to its best checkpoint, as its rival's decoder.
+        """
         policy, data, stage = self.policy, self.data, f"{stage}/{self.seed}"
+        judge = self._judge_blind if blind and self.config.recipe == "touch" else None
 
         def train() -> Params:
             own, devices = self._order(config.batch_size)["own"], math.prod(self.context.devices.shape[:2])
@@ -138,11 +142,12 @@ class StudySeed:
                 policy, data, self.evidence, config, seed=self.seed, blind=blind, own=own, devices=devices
             )
             params = untrained(policy, data, self.seed) | dict(start)
-            with stage_hooks(self.context, stage, config.steps) as hooks:
-                return train_sft(policy, params, feed, config, hooks, seed=self.seed, blind=blind)
+            with stage_hooks(self.context, stage, config.steps, scored=judge is not None) as hooks:
+                return train_sft(policy, params, feed, config, hooks, seed=self.seed, blind=blind, held_out=judge)
 
         values = {"records": data.store.digest, "config": config, "clip": data.clip, "blind": blind}
-        arrays = {"evidence": self.evidence, "rows": data.parts["sft"], "start": start}
+        judged = np.zeros(0) if judge is None else data.parts["val"]
+        arrays = {"evidence": self.evidence, "rows": data.parts["sft"], "start": start, "validation": judged}
         return self._shared("sft", stage, train, values, arrays)
 
     def run_decoder(
@@ -212,6 +217,10 @@ class StudySeed:
     def _judge(self, validation: Validation) -> Callable[[Params], float]:
         """The share of right answers about validation contacts, of parameters."""
         return lambda params: share_right(evaluate_policy(self.policy, params, *validation, alone=False))
+
+    def _judge_blind(self, params: Params) -> float:
+        """The same of a policy without touch, which trains its view too."""
+        return self._judge((self.encode(params, "val", blind=True), self.data.labels("val")))(params)
 
     def _order(self, batch_size: int) -> dict[str, Any]:
         """Batches of this seed, of which the process reads its own rows."""

@@ -27,7 +27,6 @@ from experiments.study.seed import BLIND, CONTINUED, SFT, EvalVariant, SeedTrain
 from experiments.study.stages import (
     GRPOArm,
     ProbeFeatures,
-    StudySFT,
     Weights,
     gather_evidence,
     make_arm,
@@ -78,7 +77,6 @@ SMOKE = StudyConfig(
     seeds=2,
     scenes=SceneConfig(objects=60, sites=1),
     encoders=EncoderTrainingConfig(steps=12, batch_size=8),
-    blind=StudySFT(steps=12, batch_size=8, micro_contacts=8),
     decoder=dataclasses.replace(DECODER, steps=6, batch_size=4, save_every=3),
     grpo=dataclasses.replace(GRPOConfig.paper(), prompts=4, micro_prompts=2),
     grpo_steps=4,

@@ -1,6 +1,7 @@
 """Settings of every study, whichever model it trains: data, stages, seeds."""
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -83,8 +84,6 @@ class TrainingConfig(SourceConfig):
     """Training of the encoders by a linear head, under recipe `touch`; 0 steps leave it out."""
     sft: StudySFT = StudySFT(steps=0)
     """SFT end to end, after that of the encoders where there is any; recipe `paper` needs it."""
-    blind: StudySFT = StudySFT(steps=300, micro_contacts=16)
-    """Without touch there is no encoder, and micro-batches would only cost."""
     recipe: Recipe = "touch"
     """`paper` is the published recipe; `touch` trains in phases and anchors GRPO (see `Recipe`)."""
     decoder: SFTConfig = DECODER
@@ -101,6 +100,16 @@ class TrainingConfig(SourceConfig):
     """Adapters that SFT and GRPO train in the place of the adapted towers' weights; rank 0 trains the weights."""
     samples: int = 8
     """Sampled answers to each test question, for pass@k, maj@k and calibration; 0 asks for greedy answers only."""
+
+    @property
+    def blind(self) -> StudySFT:
+        """SFT of the control without touch: as many questions as in the policy's SFT, asked as in its last phase."""
+        if self.recipe == "paper":
+            return self.sft
+        last = {field.name: getattr(self.decoder, field.name) for field in dataclasses.fields(SFTConfig)}
+        end_to_end = self.sft.steps * self.sft.batch_size * self.sft.questions
+        more = math.ceil(end_to_end / (self.decoder.batch_size * self.decoder.questions))
+        return StudySFT(**last | {"steps": self.decoder.steps + more})
 
     @property
     def continued(self) -> SFTConfig:
@@ -129,7 +138,7 @@ class TrainingConfig(SourceConfig):
                 "set it, for example to 1350"
             )
         unused(self.decoder, "decoder", pack=0, curriculum=0.0)
-        for name in ("sft", "blind", "decoder"):
+        for name in ("sft", "decoder"):
             if (questions := getattr(self, name).questions) > len(ATTRIBUTES):
                 raise ValueError(
                     f"{name}.questions is {questions}: must be at most {len(ATTRIBUTES)}, one each; lower it"

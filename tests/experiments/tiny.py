@@ -31,7 +31,6 @@ STUDY = StudyConfig(
     probe=ProbeConfig(folds=2, iterations=4),
     encoders=EncoderTrainingConfig(steps=2, batch_size=4),
     sft=StudySFT(steps=3, batch_size=4),
-    blind=StudySFT(steps=2, batch_size=4),
     decoder=SFTConfig(steps=2, batch_size=2, questions=2, save_every=1, optimizer=OptimizerConfig(learning_rate=1e-3)),
     grpo=dataclasses.replace(GRPOConfig.paper(), prompts=2, group=3, length=20, micro_prompts=2),
     grpo_steps=2,

@@ -50,7 +50,6 @@ STUDY = StudyConfig(
     probe=ProbeConfig(folds=2, iterations=4),
     encoders=EncoderTrainingConfig(steps=60, batch_size=4, save_every=3),
     sft=StudySFT(steps=60, batch_size=4, save_every=3),
-    blind=StudySFT(steps=30, batch_size=4, save_every=3, micro_contacts=4),
     decoder=dataclasses.replace(DECODER, steps=30, batch_size=2, questions=2, save_every=3),
     grpo=dataclasses.replace(GRPOConfig.paper(), prompts=2, group=3, length=20, micro_prompts=2),
     grpo_steps=60,
@@ -61,7 +60,6 @@ SHORT = dataclasses.replace(
     STUDY,
     encoders=dataclasses.replace(STUDY.encoders, steps=12),
     sft=dataclasses.replace(STUDY.sft, steps=12),
-    blind=dataclasses.replace(STUDY.blind, steps=6),
     decoder=dataclasses.replace(STUDY.decoder, steps=6),
     grpo_steps=12,
 )

@@ -165,13 +165,20 @@ def test_devices_share_a_micro_batch():
         config.packing(3)
 
 
+def test_the_control_without_touch_answers_as_many_questions_as_the_policy():
+    study = dataclasses.replace(tiny.STUDY, recipe="touch")
+    decoder, blind = study.decoder, study.blind  # 3 × 4 × 2 questions end to end, 2 × 2 × 2 in the decoder's phase
+    assert blind.steps * blind.batch_size * blind.questions == 24 + 8
+    assert (blind.optimizer, blind.conclusion_weight) == (decoder.optimizer, decoder.conclusion_weight)
+    assert dataclasses.replace(study, recipe="paper").blind == study.sft
+
+
 @pytest.mark.parametrize(
     ("phase", "change", "said"),
     [
         ("decoder", {"pack": WIDTH}, "decoder.pack is 128: must be 0, for this stage does not read it"),
         ("decoder", {"curriculum": 0.5}, r"decoder.curriculum is 0\.5: must be 0"),
         ("decoder", {"questions": 5}, "decoder.questions is 5: must be at most 4"),
-        ("blind", {"questions": 5}, "blind.questions is 5: must be at most 4"),
     ],
 )
 def test_options_that_a_phase_does_not_read_are_refused(phase, change, said):
