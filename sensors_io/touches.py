@@ -146,16 +146,28 @@ def _resize(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 def describe(touch: VideoTouch) -> np.ndarray:
     """Describe a touch, float32 [D], D = `len(families())`: the mean over its frames in contact, then its course."""
-    frames = [np.concatenate([values for _, values in _parts(frame @ COLOURS)]) for frame in touch.difference]
-    return np.concatenate([np.mean(frames, 0), _course(touch.change)]).astype(np.float32)
+    return np.concatenate([describe_frames(touch.difference @ COLOURS), _course(touch.change)]).astype(np.float32)
+
+
+def describe_frames(frames: np.ndarray) -> np.ndarray:
+    """Mean description of frames in contact [F, H, W, 3] without the course, float32 [`len(frame_families())`].
+
+    The channels may be fields in the place of colours, scaled to grey levels.
+    """
+    every = [np.concatenate([values for _, values in _parts(frame)]) for frame in frames]
+    return np.mean(every, 0).astype(np.float32)
 
 
 @functools.cache
 def families() -> tuple[str, ...]:
     """The family of each of the D numbers, such as `edges`."""
-    blank = np.zeros((*_LEAST, 3), np.float32)
-    of_frames = [name for name, values in _parts(blank) for _ in values]
-    return (*of_frames, *["course"] * len(_course(np.zeros((3, *PROBE_PX), np.float32))))
+    return (*frame_families(), *["course"] * len(_course(np.zeros((3, *PROBE_PX), np.float32))))
+
+
+@functools.cache
+def frame_families() -> tuple[str, ...]:
+    """Those of the numbers of frames alone."""
+    return tuple(name for name, values in _parts(np.zeros((*_LEAST, 3), np.float32)) for _ in values)
 
 
 def _parts(picture: np.ndarray) -> Iterator[_Part]:

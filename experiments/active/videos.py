@@ -24,7 +24,8 @@ from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
 from experiments.core.results import Picture, Table, named_table
 from experiments.recordings.cross_validation import deal_folds
-from experiments.recordings.descriptions import SENSOR, DescribedVideos, describe_source
+from experiments.recordings.descriptions import DescribedVideos, describe_source
+from experiments.recordings.scene_presses import SENSOR
 from experiments.study.estimates import RESAMPLES, points
 from sensors_io.touches import families
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap

@@ -11,12 +11,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from experiments.core.context import Context
-from experiments.study.sources import SourceConfig, prepare_records
+from experiments.recordings.scene_presses import press_pictures
 from sensors_io.errors import MALFORMED
 from sensors_io.importers.keep import ImportSourceError, Skip
 from sensors_io.importers.physiclear import read_labels
 from sensors_io.importers.video import VideoError
-from sensors_io.records import RecordStore
 from sensors_io.scenes.cards import solid_of
 from sensors_io.scenes.config import SceneConfig, config_hash
 from sensors_io.schema import ATTRIBUTES
@@ -26,7 +25,7 @@ from touchr1_jax.models.description_policy import LANGUAGE, LEVELS
 
 VERSION = 1  # raised when a description changes, so that no cache outlives it
 SUFFIXES = (".mov", ".mp4", ".avi", ".mkv")  # file names that count as videos in a folder that no table lists
-SENSOR = "gelsight_mini"
+SceneDescriber = Callable[[SceneConfig], Float[np.ndarray, "n D"]]
 ROWS = ("names", "objects", "label", "x", "rating")  # of `DescribedVideos`, one entry for each video
 
 
@@ -43,6 +42,12 @@ class DescribedVideos:
     x: Float[np.ndarray, "n D"]
     rating: Float[np.ndarray, "n A"]
     skipped: tuple[Skip, ...] = ()
+
+    @property
+    def families(self) -> tuple[str, ...]:
+        """The family of each number of a description; those of another description have none of `describe`'s."""
+        own = families()
+        return own if self.x.shape[1] == len(own) else ("",) * self.x.shape[1]
 
     def labelled(self) -> "DescribedVideos":
         """The videos whose levels are all known."""
@@ -153,41 +158,44 @@ def _state(file: Path) -> tuple[int, ...]:
     return (file.stat().st_size, file.stat().st_mtime_ns) if file.is_file() else ()
 
 
-def auxiliary_data(config: SceneConfig, sets: int, every: DescribedVideos, context: Context) -> AuxiliaryData:
-    """Describe sets of scenes that differ in their seeds, and take the videos without all levels."""
-    made = [describe_scenes(dataclasses.replace(config, seed=config.seed + i), context) for i in range(sets)]
+def auxiliary_data(
+    config: SceneConfig, sets: int, every: DescribedVideos, context: Context, describe_set: SceneDescriber | None = None
+) -> AuxiliaryData:
+    """Describe sets of scenes that differ in their seeds, and take the videos without all levels.
+
+    `describe_set` gives the descriptions of a set, float32 [n, D]; by default `describe_scenes`.
+    """
+    of = describe_set or (lambda scenes: describe_scenes(scenes, context))
+    every_set = [dataclasses.replace(config, seed=config.seed + i) for i in range(sets)]
+    target, kinds = zip(*(scene_properties(scenes) for scenes in every_set), strict=True)
     unlabelled = every.x[np.any(every.label < 0, 1)]
-    x, target, kinds = zip(*made, strict=True)
-    return AuxiliaryData(scene_x=np.array(x), scene_target=np.array(target), kinds=kinds[0], unlabelled=unlabelled)
+    x = np.array([of(scenes) for scenes in every_set])
+    return AuxiliaryData(scene_x=x, scene_target=np.array(target), kinds=kinds[0], unlabelled=unlabelled)
 
 
-def describe_scenes(config: SceneConfig, context: Context) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Generate and describe presses as a GelSight Mini sees them: descriptions, properties and the kinds of these."""
+def describe_scenes(config: SceneConfig, context: Context) -> Float[np.ndarray, "n D"]:
+    """Generate and describe presses as a GelSight Mini sees them."""
 
     def make() -> dict[str, np.ndarray]:
-        source = SourceConfig(scenes=config)
-        store = RecordStore(prepare_records(source, context))
-        x, target = [], []
         with context.timed("scenes"):
-            for i, key in enumerate(context.each("describing scenes", store.contacts)):
-                frames = store.contact(i, fields=False)[SENSOR].frames
-                if frames is None:
-                    raise ValueError(f"{key}: {SENSOR} has no camera frames: scenes must be generated with pictures")
-                levels = store.objects[key.object_id].label_row()
-                x.append(describe(touch_of_scene(frames)))
-                one_hot = [np.eye(SCENE_LEVELS[a])[level] for a, level in zip(ATTRIBUTES, levels, strict=True)]
-                target.append(np.concatenate(one_hot))
-        return {"x": np.array(x), "target": np.array(target)}
+            every = context.each("generating and describing scenes", range(config.contact_count))
+            return {"x": np.array([describe(touch_of_scene(press_pictures(config, i))) for i in every])}
 
-    scenes = _cached(context, "scene-descriptions", [VERSION, config_hash(config), families()], make)
+    return _cached(context, "scene-descriptions", [VERSION, config_hash(config), families()], make)["x"]
+
+
+def scene_properties(config: SceneConfig) -> tuple[Float[np.ndarray, "n T"], np.ndarray]:
+    """Properties of the objects that are pressed, see `AuxiliaryData`, and the kind of each."""
     owner = np.repeat(np.arange(config.objects), config.sites)
-    truth = np.log([list(solid_of(config, i).truth().values()) for i in owner])
+    solids = [solid_of(config, i) for i in owner]
+    labels = np.array([[solid.labels()[a] for a in ATTRIBUTES] for solid in solids])
+    named = np.concatenate([np.eye(SCENE_LEVELS[a])[labels[:, i]] for i, a in enumerate(ATTRIBUTES)], 1)
+    truth = np.log([list(solid.truth().values()) for solid in solids])
     spread = truth.std(0)
     physics = (truth - truth.mean(0)) / np.where(spread > 0, spread, 1.0)
     levels = len(LANGUAGE.attributes) * LEVELS
-    named = scenes["target"]
     kinds = ["levels"] * levels + ["material"] * (named.shape[1] - levels) + ["physics"] * physics.shape[1]
-    return scenes["x"], np.concatenate([named, physics], 1), np.array(kinds)
+    return np.concatenate([named, physics], 1), np.array(kinds)
 
 
 def _cached(

@@ -18,7 +18,6 @@ import numpy as np
 from jaxtyping import Float
 
 from experiments.recordings.descriptions import AuxiliaryData, DescribedVideos
-from sensors_io.touches import families
 from touchr1_jax.training.kernel_probe import (
     KernelProbeConfig,
     cross_probe,
@@ -78,7 +77,7 @@ class ProbedVideos:
         both = np.concatenate([np.concatenate([training.x, videos.x]), sensed], 1).astype(np.float64)
         self._fitted, self._others = both[: len(training.x)], both[len(training.x) :]
         self._training, self._config = training, config
-        self._family = np.array([*families(), *names])
+        self._family = np.array([*training.families, *names])
         self._weight = object_weights(training.objects, np.ones(len(training.names), bool))
         self.target = graded_targets(
             training.label,

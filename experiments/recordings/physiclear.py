@@ -11,7 +11,7 @@ level given people's ratings of the object (training objects only).  The saved p
 `--predict` answers with it, in words with probabilities: each video of a folder separately, several named videos also
 together, as touches of one object.
 
-On one core of a busy machine: half an hour for scenes, once, 6 minutes for the rest (`smoke` half a minute).  Expected:
+On one core: 5 minutes for scenes, once, 6 minutes for the rest (`smoke` half a minute).  Expected:
 from one video, all three levels right for 45 % of the videos, 73 % of the levels right, OMAE .31; from all videos of an
 object 51 %, 77 % and .26.  People agree with 75 to 79 % of the labels that they rated.
 """
@@ -67,7 +67,7 @@ GOALS: Mapping[str, Mapping[str, float]] = {
 MINUTES = 15.0  # bound of the time for scenes and one partition, all folds together
 DEVELOPMENT = 101  # seed of the partition that ablations and curves are measured on
 UNSURE = 0.3  # probability that all three are right, below which an answer says that it is unsure
-CACHED = {"descriptions": "descriptions of videos", "data": "scenes", "scenes": "descriptions of scenes"}
+CACHED = {"descriptions": "descriptions of videos", "scenes": "descriptions of scenes"}
 """Stages that cost time only where the cache lacks their output, and that output."""
 
 _ELSEWHERE = "On the partition that settings were chosen on, not one of those of the first table."

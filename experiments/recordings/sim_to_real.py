@@ -1,0 +1,378 @@
+"""Which parts of a generated scene help to read real videos, and do fields read them better than pictures?
+
+    python -m experiments sim_to_real --data-dir DIR [--calibration CAL.npz] [--scale smoke]
+
+Probes learn hardness, roughness and protrusion from generated presses and read them in PhysiCLeAR's videos, as in
+`physiclear`, without its policy.  One part of the scene at a time is left out, made coarser, or added; the presses are
+of the same objects at the same places.  With a calibration of a GelSight Mini (`python -m sensors_io calibrate`), depth
+and slopes stand in the place of pictures, in both worlds.
+
+Development partitions of `physiclear` (its test partitions are not touched); intervals over objects, paired by video.
+On one core: 50 minutes, 6 more with a calibration (`smoke` a minute).  Expected: see `experiments/LOG.md`.
+"""
+
+import dataclasses
+import functools
+import re
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from experiments.core.charts import Panel, Rule, draw, estimates
+from experiments.core.context import Context
+from experiments.core.errors import ConfigurationError
+from experiments.core.results import Picture, Results, Table, named_table
+from experiments.core.runner import Experiment
+from experiments.core.text import bounds, interval
+from experiments.recordings.cross_validation import FORMATS, UNITS, CrossValidation, deal_folds, intervals
+from experiments.recordings.descriptions import DescribedVideos, auxiliary_data, describe_scenes, describe_source
+from experiments.recordings.findings import JudgedAnswers, gains
+from experiments.recordings.learning import LearnConfig
+from experiments.recordings.scene_presses import AS_GENERATED, VARIANTS, PressVariant, press_pictures
+from sensors_io.calibration.calibrate import calibrate
+from sensors_io.calibration.generated_presses import generated_presses
+from sensors_io.fields.depth import DepthReader
+from sensors_io.fields.types import Calibration
+from sensors_io.scenes.config import SceneConfig
+from sensors_io.touches import (
+    SIZE_PX,
+    describe,
+    describe_frames,
+    families,
+    frame_families,
+    read_touch,
+    touch_of_scene,
+)
+from touchr1_jax.bench.statistics import Interval
+
+SCORED = ("all right", "mean", "OMAE")
+NO_SCENES = "no scenes: probes of the videos alone"
+PICTURES, WITH_COURSE, FIELDS, BOTH = "pictures", "pictures and their course", "fields", "pictures and fields"
+SLOPE_GREY, DEPTH_GREY = 100.0, 100.0
+"""Grey levels that a slope of 1 and a depth of 1 mm count as: about what a slope of 1 changes in a picture."""
+
+BALL_MM, BALLS = 6.31, 40  # generated presses that the scenes' pictures are calibrated by
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SimToRealStudy:
+    """Videos, scenes, partitions."""
+
+    data_dir: Path | None = None  # folder with labels.json and videos/
+    calibration: Path | None = None
+    """Calibration of a GelSight Mini that shows the videos' window; without one no fields are read."""
+    objects: int | None = None  # labelled objects to use; all by default
+    frames: int = 8  # frames in contact that are described of each video
+    folds: int = 10
+    seeds: tuple[int, ...] = tuple(range(101, 109))  # of the partitions
+    scenes: SceneConfig = SceneConfig(objects=800, sites=1)
+    scene_sets: int = 2  # sets of consecutive seeds, whose probes are averaged
+    learn: LearnConfig = LearnConfig()
+
+
+def run(config: SimToRealStudy, context: Context) -> Results:
+    """Score the probes of every variant of the scenes, and of every input; `ConfigurationError` without data_dir."""
+    if config.data_dir is None:
+        raise ConfigurationError("data_dir is None: must be the folder of labels.json and videos/; give --data-dir")
+    videos = describe_source(config.data_dir, config.frames, context, config.objects)
+    parts, milliseconds = dict[str, JudgedAnswers](), dict[str, float]()
+    for name, variant in context.each("parts of a scene", VARIANTS.items()):
+        describe_set = functools.partial(described_presses, variant=variant, context=context)
+        answer = functools.partial(timed_answers, config, videos, describe_set, context)
+        found = context.once(f"scenes/{plain(name)}", answer)
+        parts[name], milliseconds[name] = judged(found["log_prob"], videos), found["milliseconds"]
+    own = dataclasses.replace(config.learn.evidence, families=tuple(dict.fromkeys(families())), by_attribute=())
+    alone = dataclasses.replace(config, learn=dataclasses.replace(config.learn, evidence=own))
+    pictured = functools.partial(describe_scenes, context=context)
+    bare = functools.partial(answers, alone, videos, pictured, context)
+    parts[NO_SCENES] = judged(context.once("no-scenes", bare), videos)
+    inputs: dict[str, JudgedAnswers] = {}
+    seconds: dict[str, float] = {}
+    if config.calibration is not None:
+        calibration = Calibration.load(config.calibration).at_size(SIZE_PX)
+        inputs, seconds = read_inputs(config, videos, calibration, context)
+        inputs = {WITH_COURSE: parts[AS_GENERATED], **inputs}
+    return report(config, videos, parts, milliseconds, inputs, seconds)
+
+
+def plain(name: str) -> str:
+    """A name that a stage may have."""
+    return "-".join(re.findall(r"\w+", name))
+
+
+def answers(
+    config: SimToRealStudy,
+    videos: DescribedVideos,
+    describe_set: Callable[[SceneConfig], Float[np.ndarray, "n D"]],
+    context: Context,
+) -> list[Any]:
+    """Log-probabilities of the answers about all labelled videos on every partition, [P, n, 27]."""
+    labelled = videos.labelled()
+    auxiliary = auxiliary_data(config.scenes, config.scene_sets, videos, context, describe_set)
+    rows = []
+    for seed in config.seeds:
+        fold = deal_folds(labelled.objects, labelled.label, config.folds, seed)
+        split = CrossValidation(
+            config=config.learn, videos=labelled, auxiliary=auxiliary, fold=fold, seed=seed, context=context
+        )
+        rows.append(split.probes().tolist())
+    return rows
+
+
+def timed_answers(
+    config: SimToRealStudy,
+    videos: DescribedVideos,
+    describe_set: Callable[[SceneConfig], Float[np.ndarray, "n D"]],
+    context: Context,
+) -> dict[str, Any]:
+    """The same, and processor milliseconds of a press, compilation and description included."""
+    spent = [0.0]
+
+    def timed(scenes: SceneConfig) -> Float[np.ndarray, "n D"]:
+        start = time.process_time()
+        found = describe_set(scenes)
+        spent[0] += time.process_time() - start
+        return found
+
+    log_prob = answers(config, videos, timed, context)
+    presses = config.scene_sets * config.scenes.contact_count
+    return {"log_prob": log_prob, "milliseconds": 1e3 * spent[0] / presses}
+
+
+def judged(log_prob: Sequence[Any], videos: DescribedVideos) -> JudgedAnswers:
+    """Answers of probes, which are their own evidence."""
+    labelled, rows = videos.labelled(), np.array(log_prob)
+    return JudgedAnswers(log_prob=rows, evidence=rows, label=labelled.label, objects=labelled.objects)
+
+
+def described_presses(config: SceneConfig, *, variant: PressVariant, context: Context) -> Float[np.ndarray, "n D"]:
+    """Descriptions of a set of presses."""
+    every = context.each("generating and describing", range(config.contact_count))
+    return np.array([describe(touch_of_scene(press_pictures(config, i, variant))) for i in every])
+
+
+def read_inputs(
+    config: SimToRealStudy, videos: DescribedVideos, calibration: Calibration, context: Context
+) -> tuple[dict[str, JudgedAnswers], dict[str, float]]:
+    """Answers from pictures, from fields and from both, and median processor seconds to describe a video."""
+    size = (config.scenes.image_px,) * 2
+    balls = generated_presses(BALL_MM, BALLS, 0)
+    of_scenes = calibrate(balls, tuple(map(str, range(len(balls)))), "gelsight_mini")[0].at_size(size)
+    frames, sets = len(frame_families()), dict[int, np.ndarray]()
+    read = context.once("fields-of-videos", functools.partial(fields_of_videos, config, videos, calibration, context))
+
+    def pictured(scenes: SceneConfig) -> np.ndarray:
+        return describe_scenes(scenes, context)[:, :frames]
+
+    def fields(scenes: SceneConfig) -> np.ndarray:
+        if scenes.seed not in sets:
+            every = context.each("reading fields of scenes", range(scenes.contact_count))
+            sets[scenes.seed] = np.array([fields_of_scene(scenes, i, of_scenes) for i in every])
+        return sets[scenes.seed]
+
+    def joined(scenes: SceneConfig) -> np.ndarray:
+        return np.concatenate([pictured(scenes), fields(scenes)], 1)
+
+    of_videos = np.array(read["x"], np.float32)
+    seen = videos.x[:, :frames]
+    variants = {
+        PICTURES: (seen, pictured),
+        FIELDS: (of_videos, fields),
+        BOTH: (np.concatenate([seen, of_videos], 1), joined),
+    }
+    found = dict[str, JudgedAnswers]()
+    for name, (x, describe_set) in variants.items():
+        described = dataclasses.replace(videos, x=x)
+        answer = functools.partial(answers, config, described, describe_set, context)
+        found[name] = judged(context.once(f"inputs/{plain(name)}", answer), described)
+    picture, field, course = (float(np.median(read[name])) for name in ("pictures s", "fields s", "course s"))
+    return found, {WITH_COURSE: course, PICTURES: picture, FIELDS: field, BOTH: picture + field}
+
+
+def fields_of_videos(
+    config: SimToRealStudy, videos: DescribedVideos, calibration: Calibration, context: Context
+) -> dict[str, Any]:
+    """Descriptions of the fields of every video, and processor seconds of each way to describe it after decoding."""
+    if config.data_dir is None:
+        raise ValueError("data_dir is None: must be the folder of the videos; set it")
+    rows = dict[str, list[Any]](x=[])
+    for name in context.each("reading fields of videos", videos.names):
+        touch = read_touch(config.data_dir / "videos" / str(name), config.frames)
+        ways: dict[str, Callable[[], np.ndarray]] = {
+            "fields s": functools.partial(fields_of, touch.frames, touch.rest, calibration),
+            "pictures s": functools.partial(describe_frames, touch.difference),
+            "course s": functools.partial(describe, touch),
+        }
+        made = dict[str, np.ndarray]()
+        for way, make in ways.items():
+            start = time.process_time()
+            made[way] = make()
+            rows.setdefault(way, []).append(time.process_time() - start)
+        rows["x"].append(made["fields s"].tolist())
+    return rows
+
+
+def fields_of_scene(config: SceneConfig, index: int, calibration: Calibration) -> Float[np.ndarray, "D"]:
+    """Description of the fields of a generated press, of the frames that `touch_of_scene` describes."""
+    frames = press_pictures(config, index)
+    return fields_of(frames[touch_of_scene(frames).position], frames[0].astype(np.float32), calibration)
+
+
+def fields_of(frames: np.ndarray, rest: np.ndarray, calibration: Calibration) -> Float[np.ndarray, "D"]:
+    """Description of depth and slopes as the colours of a picture; arguments as in `VideoTouch`."""
+    at_rest = dataclasses.replace(calibration, background=np.clip(rest, 0, 255).round().astype(np.uint8))
+    read, maps = DepthReader(at_rest), []
+    for frame in frames:
+        depth, _ = read(frame)
+        down_y, down_x = np.gradient(depth, calibration.mm_per_px)
+        field = np.stack([DEPTH_GREY * depth, SLOPE_GREY * down_x, SLOPE_GREY * down_y], -1)
+        maps.append(cv2.resize(field.astype(np.float32), SIZE_PX[::-1], interpolation=cv2.INTER_LINEAR))
+    return describe_frames(np.stack(maps))
+
+
+def report(
+    config: SimToRealStudy,
+    videos: DescribedVideos,
+    parts: Mapping[str, JudgedAnswers],
+    milliseconds: Mapping[str, float],
+    inputs: Mapping[str, JudgedAnswers],
+    seconds: Mapping[str, float],
+) -> Results:
+    """Tables, charts and what pays."""
+    lost = {name: gains(found, parts[AS_GENERATED])["mean"] for name, found in parts.items() if name != AS_GENERATED}
+    changed = {name: gain for name, gain in lost.items() if name != NO_SCENES}
+    pays = [f"{name} ({interval(gain, '+.1f')})" for name, gain in changed.items() if gain.high < 0]
+    free = [name for name, gain in changed.items() if gain.low <= 0 <= gain.high]
+    helps = [f"{name} ({interval(gain, '+.1f')})" for name, gain in changed.items() if gain.low > 0]
+    verdict = [
+        f"Scenes as generated are worth {interval(negative(lost[NO_SCENES]), '+.1f')} points of single levels over "
+        "probes of the videos alone.",
+        f"Of {len(changed)} changes, these cost accuracy: {'; '.join(pays) or 'none'}.  These gain: "
+        f"{'; '.join(helps) or 'none'}.  No difference is seen for: {'; '.join(free) or 'none'}.  By chance alone one "
+        "interval in twenty excludes 0.",
+    ]
+    tables, pictures = [part_table(parts, lost, milliseconds)], [part_picture(changed)]
+    if inputs:
+        gain = gains(inputs[FIELDS], inputs[PICTURES])["mean"]
+        verdict.append(
+            f"Fields in the place of pictures: {interval(gain, '+.1f')} points of single levels, "
+            f"{seconds[FIELDS]:.2f} s of a core a video in the place of {seconds[PICTURES]:.2f}."
+        )
+        tables.append(input_table(inputs, seconds))
+        pictures.append(input_picture(inputs, seconds))
+    labelled = videos.labelled()
+    return Results(
+        verdict=tuple(verdict),
+        tables=tuple(tables),
+        pictures=tuple(pictures),
+        settings={"partitions": len(config.seeds), "folds": config.folds, "sets of scenes": config.scene_sets},
+        data={"objects": len(np.unique(labelled.objects)), "videos": len(labelled.names)},
+    )
+
+
+def negative(gain: Interval) -> Interval:
+    """The gain of the other side."""
+    return dataclasses.replace(gain, mean=-gain.mean, low=-gain.high, high=-gain.low)
+
+
+def scored(found: JudgedAnswers) -> dict[str, Any]:
+    """Cells of a table: the scores, mean over the partitions."""
+    return {name: one.mean for name, one in intervals(found.levels, found.truth, found.owner).items()}
+
+
+def part_table(
+    parts: Mapping[str, JudgedAnswers], lost: Mapping[str, Interval], milliseconds: Mapping[str, float]
+) -> Table:
+    """All variants of the scenes."""
+    rows = []
+    for name, found in parts.items():
+        gain = lost.get(name)
+        row: dict[str, Any] = {"scenes": name, **scored(found)}
+        row["gain"] = None if gain is None else gain.mean
+        row["95 %"] = None if gain is None else bounds(gain.low, gain.high, "+.1f")
+        row["a press"] = milliseconds.get(name)
+        rows.append(row)
+    return named_table(
+        "Parts of a scene",
+        rows,
+        formats={**FORMATS, "gain": "+.1f", "a press": ".0f"},
+        units={**UNITS, "gain": "points", "a press": "ms"},
+        meanings={
+            "gain": f"of the mean over '{AS_GENERATED}', paired by video",
+            "95 %": "of the gain, over objects",
+            "a press": "processor time to generate and describe one, compilation included",
+        },
+        note="Probes alone, on the partitions that settings were chosen on.",
+    )
+
+
+def part_picture(changed: Mapping[str, Interval]) -> Picture:
+    """Gain of every change."""
+    series = estimates("", [*changed.values()])
+    axes: dict[str, Any] = {"x_label": "gain in levels right (points)", "rows": [*changed], "rules": [Rule(x=0.0)]}
+    return Picture(
+        name="parts",
+        title="What a part of the scene is worth on real videos",
+        caption=f"Mean of the three levels against scenes '{AS_GENERATED}'; bars are 95 % intervals over objects.",
+        content=draw([Panel([series], **axes)], size=(8.0, 5.0)),
+    )
+
+
+def input_table(inputs: Mapping[str, JudgedAnswers], seconds: Mapping[str, float]) -> Table:
+    """Pictures, fields and both."""
+    rows = []
+    for name, found in inputs.items():
+        row: dict[str, Any] = {"input": name, **scored(found)}
+        gain = None if name == PICTURES else gains(found, inputs[PICTURES])["mean"]
+        row["gain"] = None if gain is None else gain.mean
+        row["95 %"] = None if gain is None else bounds(gain.low, gain.high, "+.1f")
+        row["a video"] = seconds[name]
+        rows.append(row)
+    return named_table(
+        "Pictures and fields",
+        rows,
+        formats={**FORMATS, "gain": "+.1f", "a video": ".2f"},
+        units={**UNITS, "gain": "points", "a video": "s"},
+        meanings={
+            "gain": f"of the mean over '{PICTURES}', paired by video",
+            "95 %": "of the gain, over objects",
+            "a video": "median processor time to read and describe its frames after decoding",
+        },
+        note="Fields are depth and its slopes by a calibration; 'course' is how the change grows and fades.",
+    )
+
+
+def input_picture(inputs: Mapping[str, JudgedAnswers], seconds: Mapping[str, float]) -> Picture:
+    """Accuracy over cost."""
+    series = [
+        estimates(name, [intervals(found.levels, found.truth, found.owner)["mean"]], at=[seconds[name]], line="")
+        for name, found in inputs.items()
+    ]
+    axes: dict[str, Any] = {"x_label": "processor time a video (s)", "y_label": "levels right (%)"}
+    return Picture(
+        name="inputs",
+        title="Pictures or fields: accuracy against cost",
+        caption="Bars are 95 % intervals over objects, not paired; the table has paired gains.",
+        content=draw([Panel(series, x_limits=(0, None), better=("lower", "higher"), **axes)], size=(6.4, 3.8)),
+    )
+
+
+DEFAULT = SimToRealStudy()
+
+SMOKE = dataclasses.replace(
+    DEFAULT,
+    objects=12,
+    frames=2,
+    folds=2,
+    seeds=(101, 102),
+    scene_sets=1,
+    scenes=SceneConfig(objects=6, sites=1, image_px=28, contact_grid=24),
+    learn=dataclasses.replace(DEFAULT.learn, evidence=dataclasses.replace(DEFAULT.learn.evidence, folds=2)),
+)
+
+EXPERIMENT = Experiment(name="sim_to_real", config=DEFAULT, run=run, scales={"smoke": SMOKE})
