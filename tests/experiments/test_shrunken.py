@@ -44,12 +44,12 @@ def met(m: ModuleType, results: dict) -> bool:
 
 
 class Shrunk(NamedTuple):
-    """A configuration, what must hold of the results, and the pictures that the report has at least."""
+    """A configuration, what must hold of the results, the pictures that the report has at least, and what it takes."""
 
     config: Callable[[ModuleType], Any]
     holds: Callable[[ModuleType, dict], Any] = lambda m, r: True
     plots: str = ""
-    quick: bool = False
+    seconds: float = 60.0
 
 
 def tangential_holds(m: ModuleType, results: dict) -> bool:
@@ -72,7 +72,7 @@ def scaling_holds(m: ModuleType, results: dict) -> bool:
 ABLATION = Shrunk(lambda m: STUDY, lambda m, r: list(r["arms"]) == [*CONTROLS, *m.ABLATION.arms])
 
 RUNS = {
-    "paper_audit": Shrunk(lambda m: m.DEFAULT, met, "distance average", quick=True),
+    "paper_audit": Shrunk(lambda m: m.DEFAULT, met, "distance average", seconds=0.5),
     "vtv150k": Shrunk(
         lambda m: small(m.EXPERIMENT.scales["smoke"], probe=ProbeConfig(folds=3, iterations=4), questions=24),
         lambda m, r: {row[0]: row[10] for row in rows(r)}["guessing"] == pytest.approx(31.6, abs=0.05),
@@ -132,7 +132,9 @@ RUNS = {
     ),
     "stability_grpo": Shrunk(lambda m: m.SMOKE, plots="stability_grpo"),
     "pareto_fields": Shrunk(
-        lambda m: small(m.EXPERIMENT.scales["smoke"], rounds=2), lambda m, r: r["requirements"][0]["met"], quick=True
+        lambda m: small(m.EXPERIMENT.scales["smoke"], rounds=2),
+        lambda m, r: r["requirements"][0]["met"],
+        seconds=8.0,
     ),
     "stability_fields": Shrunk(lambda m: m.SMOKE, met, "stability_tracking stability_shear stability_depth"),
     "identifiability": Shrunk(
@@ -157,7 +159,7 @@ RUNS = {
         ),
         lambda m, r: all(q["met"] for q in r["requirements"] if "time" not in q["name"])
         and [row[3] for row in rows(r) if row[0] in ("Winkler", "PK-25")] == [0, 51],  # convolutions
-        quick=True,
+        seconds=9.0,
     ),
     "pareto_tangential": Shrunk(
         lambda m: small(m.SMOKE, contacts=1, sensors=("xense",), grid=24, frames=20, rounds=1, closed_grid=32),
@@ -244,8 +246,8 @@ def test_every_experiment_runs_shrunken_here_or_elsewhere():
 
 def marks(name: str) -> list[pytest.MarkDecorator]:
     """The flagship's family is in every CI run."""
-    paper = find("experiments")[name].module.startswith("experiments.paper.")
-    return [] if RUNS[name].quick else [pytest.mark.long if paper else pytest.mark.slow]
+    seconds, paper = RUNS[name].seconds, find("experiments")[name].module.startswith("experiments.paper.")
+    return [] if seconds < 1 else [pytest.mark.long if paper or seconds < 10 else pytest.mark.slow]
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=marks(name)) for name in RUNS])

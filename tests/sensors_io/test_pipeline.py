@@ -212,6 +212,7 @@ class TestClipBatches:
         some = clip_batches(store, [5, 1], SMALL, batch_size=2, seed=0, **once)
         assert [b["contact"].tolist() for b in some] == [[5, 1]]
 
+    @pytest.mark.long
     def test_worker_processes_change_nothing_but_speed_and_resume_exactly(self, store, tmp_path, monkeypatch):
         """They need no JAX, which takes seconds to import."""
         (tmp_path / "jax.py").write_text("raise ImportError")

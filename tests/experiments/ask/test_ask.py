@@ -94,6 +94,7 @@ def test_comparisons_follow_from_the_levels(sign, word, first):
     assert found.word == word
 
 
+@pytest.mark.long
 def test_plain_arrays_are_enough_and_misfits_are_named(asked):
     rng = np.random.default_rng(0)
     frames = {"tac3d": rng.integers(0, 255, (3, 40, 60, 3), dtype=np.uint8)}
@@ -311,6 +312,7 @@ def fetch(address, path="", body=None, **headers):
             return error.code, error.read().decode()
 
 
+@pytest.mark.long
 def test_the_demo_answers_about_objects_and_videos(address, tmp_path):
     status, page = fetch(address)
     assert status == 200

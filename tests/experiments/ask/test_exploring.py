@@ -68,6 +68,7 @@ def test_a_generated_object_answers_by_itself(saved, tmp_path, capsys):
     assert "truth" in said[-1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "arguments", [("generated:3", "generated:4"), ("press.mp4",), ("generated:soft",), ("--json",)]
 )

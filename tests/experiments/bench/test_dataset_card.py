@@ -14,6 +14,8 @@ from touchr1_jax.bench.items import KINDS, read_items
 from touchr1_jax.bench.json_lines import read_lines, write_lines
 from touchr1_jax.bench.questions.draw import Quota
 
+pytestmark = pytest.mark.long  # the experiment runs first
+
 NONE = dict.fromkeys(KINDS, 0)
 QUOTA = Quota(**NONE | {"identify": 12, "scale": 6, "compose": 4, "compare": 4, "one_sensor": 16})
 
@@ -24,7 +26,6 @@ def directory(tmp_path_factory, records):
     return run_shrunk(dataset_card, config, tmp_path_factory.mktemp("runs"))
 
 
-@pytest.mark.long
 def test_everything_is_reported(directory):
     results = read_json(directory / "results.json")
     assert all(r["met"] for r in results["requirements"])

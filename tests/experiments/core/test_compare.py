@@ -85,6 +85,7 @@ def stamps(home: Path) -> list[str]:
     return sorted(p.name for p in (home / "coin").iterdir() if not p.is_symlink())
 
 
+@pytest.mark.long
 def test_two_runs_of_one_experiment(home, capsys):
     first, second = stamps(home)
     assert main(["compare", f"coin/{first}", f"coin/{second}", "--runs-dir", str(home)], package=FAKES) == 0
@@ -96,6 +97,7 @@ def test_two_runs_of_one_experiment(home, capsys):
     assert "Cost: A " in out
 
 
+@pytest.mark.long
 def test_the_gravest_differences_come_first_and_the_others_are_counted(home, capsys):
     first, second = (home / "coin" / stamp / "results.json" for stamp in stamps(home))
     text = second.read_text()
@@ -113,6 +115,7 @@ def test_the_gravest_differences_come_first_and_the_others_are_counted(home, cap
     assert "most is -1: must be at least 0; raise it" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_what_cannot_be_compared_is_said(home, tmp_path, capsys):
     assert main(["compare", "coin", "dice", "--runs-dir", str(home)], package=FAKES) == 1
     assert "'dice' is no run" in capsys.readouterr().err

@@ -36,6 +36,7 @@ def test_every_feed_of_a_scale_is_held_to_the_bound(results):
     assert all(r.bound == 0.02 and 0 <= r.measured < 1 for r in results.requirements)
 
 
+@pytest.mark.long
 def test_cores_are_the_batch_over_the_step(results):
     (table,) = results.tables
     rows = [dict(zip((c.name for c in table.columns), row, strict=True)) for row in table.rows]

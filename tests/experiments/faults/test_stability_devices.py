@@ -47,6 +47,7 @@ def test_all_counts_are_exact(results):
         assert set(results["data"][name].values()) == {0}
 
 
+@pytest.mark.long
 def test_every_replay_and_recording_is_reported(results):
     accounts, recorded, decoders, watched, carried = results["tables"]
     assert len(accounts["rows"]) == 3

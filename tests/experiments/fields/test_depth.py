@@ -50,7 +50,11 @@ def test_near_lamps_are_no_polynomial_of_the_normal():
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name == "polynomial, varying" else pytest.mark.slow) for name in MAPS]
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.long if name == "polynomial, varying" else pytest.mark.slow)
+        for name in MAPS
+    ],
 )
 def test_every_map_reads_a_press(name):
     presses = generated_presses(6.31, 8, 0)

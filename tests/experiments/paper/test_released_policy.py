@@ -40,6 +40,7 @@ def test_the_system_says_what_an_answer_looks_like(policy):
     assert "hardness: soft, firm, hard;" in said
 
 
+@pytest.mark.long
 def test_no_answer_is_longer_than_the_longest(policy):
     """Letter by letter it is the one that says "protruding" six times."""
     texts = list(plain_answers(policy.language))
@@ -48,6 +49,7 @@ def test_no_answer_is_longer_than_the_longest(policy):
     assert longest_answer(policy.language, character_level()) == len(longest) + 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("mesh", "message"),
     [
@@ -155,6 +157,7 @@ def test_an_export_computes_the_same_from_the_released_format(folder, saved, str
         export_merged(tmp_path / "merged", saved, jnp.dtype(jnp.float32))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("file", "message"),
     [
@@ -235,6 +238,7 @@ def test_weights_of_the_same_size_with_another_byte_at_either_end_are_refused(tm
         require_same(tmp_path, context)
 
 
+@pytest.mark.long
 def test_completions_must_have_room_for_an_answer(checkpoint):
     model = dataclasses.replace(MODEL, completion_tokens=20)
     with pytest.raises(SizeError, match=r"model\.completion_tokens is 20: the longest answer takes \d+ tokens"):

@@ -29,6 +29,7 @@ def answers(writer, batch):
         yield asked, batch.streams[i, 0], read(writer.language, text)
 
 
+@pytest.mark.long
 def test_drawn_answers_parse_and_agree_with_themselves(writer, batch):
     """What is concluded was compared, and no other level is perceived by more of the sensors that the prompt names."""
     for asked, streams, said in answers(writer, batch):

@@ -66,6 +66,7 @@ def test_another_run_finds_the_parameters_and_the_log(sft, first, home):
     assert log.count(b"\n") == CONFIG.steps
 
 
+@pytest.mark.long
 def test_a_damaged_file_of_the_cache_is_made_again(sft, first, home):
     (path,) = (home / "cache" / "sft").glob("*.npz")
     whole = path.read_bytes()
@@ -76,6 +77,7 @@ def test_a_damaged_file_of_the_cache_is_made_again(sft, first, home):
     assert sft("found again")[0].keys() == params.keys()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("steps", "seed"), [(0, 0), (3, 1)])
 def test_another_setting_is_another_checkpoint(sft, first, steps, seed):
     before = sft("second")[1]
@@ -173,6 +175,7 @@ def test_the_source_that_sft_is_built_on_counts():
                 assert counts or f"{imported}.py" in USED, f"{name} imports {node.module}"
 
 
+@pytest.mark.long
 def test_a_resumed_run_keeps_the_order_of_its_log(sft, first, home):
     log = home / "first" / "metrics.jsonl"
     before = log.read_bytes() + b'{"stage": "grpo/a/0", "step": 0}\n'

@@ -104,6 +104,7 @@ def test_a_state_without_older_parameters_cannot_lag():
         step(state, BATCH, FROZEN)
 
 
+@pytest.mark.long
 def test_the_reference_moves_by_its_share(lagging):
     states, _ = lagging
     for before, after in itertools.pairwise(states):
@@ -242,6 +243,7 @@ def test_parts_of_several_updates_are_those_of_the_first(learn):
     close(two, one, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("minibatches", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_the_trust_region_does_not_count_the_lag_of_the_sampler(learn, minibatches):
     """The learner is far from the parameters that sampled, the update is short."""

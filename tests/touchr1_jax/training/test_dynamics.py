@@ -173,6 +173,7 @@ def test_the_target_is_the_moving_average(state, batch):
     np.testing.assert_allclose(end.target["stem"]["kernel"], 0.75 * old + 0.25 * new, rtol=1e-5, atol=1e-7)
 
 
+@pytest.mark.long
 def test_contacts_are_encoded_alike_one_by_one(state, batch):
     both = jax.jit(lambda p, b: (encode_batch(ENCODER, p, b), encode_each(ENCODER, p, b)))(state.target, batch)
     np.testing.assert_allclose(both[1], both[0], rtol=1e-4, atol=1e-5)

@@ -299,6 +299,7 @@ def test_a_server_that_stays_silent_is_named(training, stand_in, tmp_path):
     fails(training, drawn, "gave no answer in 1 tries, the last ended in TimeoutError")
 
 
+@pytest.mark.long
 def test_a_server_without_the_adapters_is_named(training, stand_in, tmp_path, monkeypatch):
     monkeypatch.setattr(stand_in, "served", Forgetful())
     message = r"refuses with status 404 \(.*The model `touch-\w+` does not exist"
