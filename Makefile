@@ -5,7 +5,10 @@ EXP    ?= ablation_ordinal
 ARGS   ?=
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
-PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
+# Bytecode is kept in the environment, whatever PYTHONDONTWRITEBYTECODE says: without it every worker, and every process
+# that a test starts, compiles all sources again.
+KEPT   := PYTHONDONTWRITEBYTECODE= PYTHONPYCACHEPREFIX=$(abspath $(VENV))/bytecode
+PYTEST := $(KEPT) $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 
 PYTHONS ?= python3.11 python3.12
 

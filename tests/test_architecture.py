@@ -60,8 +60,18 @@ def starts(name: str, prefixes: set[str]) -> bool:
 
 
 SOURCES = {name_of(p): p.read_text() for package in PACKAGES for p in sorted((ROOT / package).rglob("*.py"))}
-TREES = {module: ast.parse(source) for module, source in SOURCES.items()}
-IMPORTS = {module: imports_of(tree, module) for module, tree in TREES.items()}
+
+
+@functools.cache
+def trees() -> dict[str, ast.Module]:
+    """Of all sources, parsed where a test asks: a worker without these tests spares itself the seconds."""
+    return {module: ast.parse(source) for module, source in SOURCES.items()}
+
+
+@functools.cache
+def imports() -> dict[str, set[str]]:
+    """Names that each module imports."""
+    return {module: imports_of(tree, module) for module, tree in trees().items()}
 
 
 @functools.cache
@@ -77,7 +87,7 @@ def wrong_imports(modules: set[str], allowed: set[str], among: set[str] | None =
     """Imports by modules of these packages of names (of these packages) that are not allowed."""
     return [
         f"{module} imports {name}"
-        for module, names in IMPORTS.items()
+        for module, names in imports().items()
         if starts(module, modules)
         for name in sorted(names)
         if (among is None or starts(name, among)) and not starts(name, allowed)
@@ -94,7 +104,7 @@ def test_packages_do_not_know_each_other():
 
 def test_modules_import_their_own_part_and_lower_layers():
     wrong = []
-    for module, names in IMPORTS.items():
+    for module, names in imports().items():
         package, *parts = module.split(".")
         ours = [name for name in names if starts(name, {package}) and name.split(".")[1:2] != parts[:1]]
         if not parts:  # an `__init__` runs before every module of its package
@@ -118,9 +128,9 @@ def test_rewards_and_the_benchmark_do_not_know_the_policy():
 
 
 def test_no_module_imports_itself_by_way_of_others():
-    known = set(IMPORTS)
+    known = set(imports())
     graph = {}
-    for module, names in IMPORTS.items():  # `from a import b` is module a.b where there is one, else a
+    for module, names in imports().items():  # `from a import b` is module a.b where there is one, else a
         graph[module] = {n if n in known else n.rpartition(".")[0] for n in names} & known - {module}
     assert graph["sensors_io.pipeline"] >= {"sensors_io.selection", "sensors_io.schema"}
     tuple(graphlib.TopologicalSorter(graph).static_order())  # raises CycleError and names the cycle
@@ -132,7 +142,7 @@ def test_files_and_functions_are_short():
 
 
 def functions() -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
-    for module, tree in TREES.items():
+    for module, tree in trees().items():
         yield from ((module, n) for n in ast.walk(tree) if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef))
 
 
@@ -149,7 +159,7 @@ MUTABLE = {
 
 
 def classes() -> Iterator[tuple[str, ast.ClassDef]]:
-    for module, tree in TREES.items():
+    for module, tree in trees().items():
         yield from ((f"{module}.{n.name}", n) for n in ast.walk(tree) if isinstance(n, ast.ClassDef))
 
 
@@ -172,7 +182,7 @@ def test_class_names_are_unique():
 def test_docstrings_open_with_a_noun_or_a_verb():
     """Only the question of an experiment may open with What, Whether or How."""
     wrong = []
-    for module, tree in TREES.items():
+    for module, tree in trees().items():
         for node in ast.walk(tree):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
                 first = (ast.get_docstring(node) or "").partition("\n")[0]
@@ -184,7 +194,7 @@ def test_docstrings_open_with_a_noun_or_a_verb():
 def test_every_folder_serves_several_modules():
     """A folder that one module alone imports is a part of that module; families and commands are found by name."""
     assert len([p for p in (ROOT / "experiments").iterdir() if p.name not in NO_CODE]) <= MAX_ENTRIES
-    folders = {m for m in IMPORTS if m.count(".") >= 1 and any(other.startswith(f"{m}.") for other in IMPORTS)}
+    folders = {m for m in imports() if m.count(".") >= 1 and any(other.startswith(f"{m}.") for other in imports())}
     importers = {folder: users(folder) for folder in folders if not re.fullmatch(r"experiments\.\w+", folder)}
     assert not {folder: by for folder, by in importers.items() if len(by) == 1 and not by[0].endswith("__main__")}
 
@@ -193,7 +203,7 @@ def users(folder: str) -> list[str]:
     """Modules outside a folder that import something of it."""
     return [
         module
-        for module, names in IMPORTS.items()
+        for module, names in imports().items()
         if not starts(module, {folder}) and any(starts(name, {folder}) for name in names)
     ]
 
@@ -222,7 +232,7 @@ def test_every_global_name_exists():
     wrong = {}
     for module, source in SOURCES.items():
         if module.endswith("__main__"):
-            known = {n for top in TREES[module].body for n in bound_names(top)} | {"__name__", "__file__"}
+            known = {n for top in trees()[module].body for n in bound_names(top)} | {"__name__", "__file__"}
         else:
             known = set(vars(importlib.import_module(module)))
         if unknown := unknown_globals(source, known):
@@ -242,7 +252,7 @@ def of_the_locale(tree: ast.AST) -> set[int]:
 
 
 def test_texts_state_their_encoding():
-    assert not {module: lines for module, tree in TREES.items() if (lines := of_the_locale(tree))}
+    assert not {module: lines for module, tree in trees().items() if (lines := of_the_locale(tree))}
 
 
 def test_the_rules_see_what_they_forbid():

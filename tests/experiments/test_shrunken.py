@@ -238,21 +238,23 @@ ELSEWHERE = {
     "step_weights", "throughput_feed", "throughput_scenes", "touch_r1",
 }  # fmt: skip
 
+EXPERIMENTS = find("experiments")  # reads every source
+
 
 def test_every_experiment_runs_shrunken_here_or_elsewhere():
-    assert RUNS.keys() | ELSEWHERE == find("experiments").keys()
+    assert RUNS.keys() | ELSEWHERE == EXPERIMENTS.keys()
     assert not RUNS.keys() & ELSEWHERE
 
 
 def marks(name: str) -> list[pytest.MarkDecorator]:
     """The flagship's family is in every CI run."""
-    seconds, paper = RUNS[name].seconds, find("experiments")[name].module.startswith("experiments.paper.")
+    seconds, paper = RUNS[name].seconds, EXPERIMENTS[name].module.startswith("experiments.paper.")
     return [] if seconds < 1 else [pytest.mark.long if paper or seconds < 10 else pytest.mark.slow]
 
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=marks(name)) for name in RUNS])
 def test_the_experiment_runs_shrunken(name, tmp_path, cache_dir):
-    run, module = RUNS[name], importlib.import_module(find("experiments")[name].module)
+    run, module = RUNS[name], importlib.import_module(EXPERIMENTS[name].module)
     directory = run_shrunk(module, run.config(module), tmp_path, "--cache-dir", str(cache_dir))
     results = read_json(directory / "results.json")
     assert run.holds(module, results), results
