@@ -32,6 +32,7 @@ def test_verified_answers_name_the_evidence_and_conclude_the_label(asked):
     assert np.asarray(scene.batch.ordered).all() == bool(asked)
 
 
+@pytest.mark.long
 def test_anchored_answers_conclude_what_is_seen_and_sloppy_ones_two_levels():
     scene = draw(World(), jax.random.key(0), P)
     seen = parse(verified_answers(TIDY._replace(anchored=1.0), scene, jax.random.key(1))[0])

@@ -145,6 +145,7 @@ def test_grpo_returns_its_best_point(policy, data, params, tmp_path):
     assert all(any(np.any(a != b) for a, b in zip(x, y, strict=True)) for x, y in itertools.pairwise(points))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("recipe", "anchor"), [("touch", 1.0), ("paper", 0.0)])
 def test_one_word_chooses_the_recipe(policy, data, params, context, evidence, recipe, anchor):
     config = dataclasses.replace(tiny.STUDY, recipe=recipe)

@@ -223,7 +223,7 @@ def test_kept_patches_are_the_busy_ones_in_their_places():
 
 def test_the_rest_is_one_more_token():
     frames = np.random.default_rng(0).uniform(0, 255, (F, H, W, 3)).astype(np.float32)
-    merged = encode_alone(dataclasses.replace(WIDE, patches_kept=2, rest="merge"), frames)
+    merged = jax.eval_shape(lambda x: encode_alone(dataclasses.replace(WIDE, patches_kept=2, rest="merge"), x), frames)
     assert merged.patches.shape == (F, 3, WIDE.width)
     assert merged.pooled.shape == (F, WIDE.tokens_per_step, WIDE.width)
 

@@ -256,6 +256,7 @@ def test_grounding_is_zero_when_nothing_is_perturbed_and_sees_every_stream(exper
         assert grounding_of(one, touch.at[stream].set(one.masked_touch[stream])) > 1e-2
 
 
+@pytest.mark.long
 def test_grounding_ignores_a_stream_that_is_not_there(experience):
     one = jax.tree.map(lambda x: x[0], experience)
     features = one.batch.features

@@ -183,6 +183,7 @@ def test_state_advances_and_its_key_stays(run):
     assert all(moved)
 
 
+@pytest.mark.long
 def test_steps_draw_afresh(run):
     """The same batch at steps 1 and 2."""
     one, two = (experience_of(run.before[i], run.batches[i])[0].tokens for i in (1, 2))

@@ -62,6 +62,7 @@ def test_loop_ends_with_the_last_rollout():
     assert len(calls) == 4
 
 
+@pytest.mark.long
 def test_without_an_end_the_loop_runs_to_the_length():
     calls = []
     endless = np.full((2, 6), 5)

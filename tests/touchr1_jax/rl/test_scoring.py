@@ -55,6 +55,7 @@ def test_a_host_reward_that_is_nan_costs_its_group_alone():
     assert (shares["nonfinite_in_mine"], shares["nonfinite_in_format"]) == (pytest.approx(1 / 3), 0)
 
 
+@pytest.mark.long
 def test_a_reward_that_does_not_count_cannot_harm():
     """At weight 0, and where it does not apply."""
     nan = lambda text, parsed, target: np.nan

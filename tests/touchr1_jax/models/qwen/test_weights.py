@@ -98,6 +98,7 @@ def test_every_layout_gives_the_same_parameters(tmp_path, weights, expected, ren
     assert_equal(load_params(tmp_path, CONFIG, jnp.float32), expected)
 
 
+@pytest.mark.long
 def test_kernels_are_encoded_as_they_are_read(tmp_path, weights, expected):
     write_file(tmp_path / "model.safetensors", weights)
     assert_equal(load_params(tmp_path, CONFIG, jnp.float32, four_bits=True), quantised(expected))
@@ -159,6 +160,7 @@ def test_tied_head_beside_an_untied_config_is_missing(tmp_path, weights):
     assert "missing: lm_head.weight (96, 64)" in misfit(tmp_path, weights)
 
 
+@pytest.mark.long
 def test_a_tied_checkpoint_may_store_its_head(tmp_path, weights):
     """As some libraries write it, and only where it is the embedding."""
     tied, table = tiny.config_of(CASES["text"]), weights["model.embed_tokens.weight"]
