@@ -234,8 +234,8 @@ RUNS = {
 
 ELSEWHERE = {
     "ablation_ordinal", "active_touch", "dataset_card", "load_weights", "pareto", "pareto_storage", "physiclear",
-    "pretrain_encoder", "real_sensors", "scene_realism", "stability_devices", "stability_faults", "stability_touch",
-    "step_weights", "throughput_feed", "throughput_scenes", "touch_r1",
+    "pretrain_encoder", "real_sensors", "scene_realism", "sim_to_real", "stability_devices", "stability_faults",
+    "stability_touch", "step_weights", "throughput_feed", "throughput_scenes", "touch_r1",
 }  # fmt: skip
 
 EXPERIMENTS = find("experiments")  # reads every source
