@@ -4,7 +4,7 @@
 
 Probes learn hardness, roughness and protrusion from generated presses and read them in PhysiCLeAR's videos, as in
 `physiclear`, without its policy.  One part of the scene at a time is left out, made coarser, or added; the presses are
-of the same objects at the same places.  With a calibration of a GelSight Mini (`python -m sensors_io calibrate`), depth
+of the same objects at the same places.  With a calibration of a GelSight Mini, as `sensors_io calibrate` makes it, depth
 and slopes stand in the place of pictures, in both worlds.
 
 Development partitions of `physiclear` (its test partitions are not touched); intervals over objects, paired by video.
@@ -84,7 +84,7 @@ def run(config: SimToRealStudy, context: Context) -> Results:
     for name, variant in context.each("parts of a scene", VARIANTS.items()):
         describe_set = functools.partial(described_presses, variant=variant, context=context)
         answer = functools.partial(timed_answers, config, videos, describe_set, context)
-        found = context.once(f"scenes/{plain(name)}", answer)
+        found = context.once(f"scenes/{slug(name)}", answer)
         parts[name], milliseconds[name] = judged(found["log_prob"], videos), found["milliseconds"]
     own = dataclasses.replace(config.learn.evidence, families=tuple(dict.fromkeys(families())), by_attribute=())
     alone = dataclasses.replace(config, learn=dataclasses.replace(config.learn, evidence=own))
@@ -100,7 +100,7 @@ def run(config: SimToRealStudy, context: Context) -> Results:
     return report(config, videos, parts, milliseconds, inputs, seconds)
 
 
-def plain(name: str) -> str:
+def slug(name: str) -> str:
     """A name that a stage may have."""
     return "-".join(re.findall(r"\w+", name))
 
@@ -189,7 +189,7 @@ def read_inputs(
     for name, (x, describe_set) in variants.items():
         described = dataclasses.replace(videos, x=x)
         answer = functools.partial(answers, config, described, describe_set, context)
-        found[name] = judged(context.once(f"inputs/{plain(name)}", answer), described)
+        found[name] = judged(context.once(f"inputs/{slug(name)}", answer), described)
     picture, field, course = (float(np.median(read[name])) for name in ("pictures s", "fields s", "course s"))
     return found, {WITH_COURSE: course, PICTURES: picture, FIELDS: field, BOTH: picture + field}
 
