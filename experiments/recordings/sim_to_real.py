@@ -4,7 +4,7 @@
 
 Probes learn hardness, roughness and protrusion from generated presses and read them in PhysiCLeAR's videos, as in
 `physiclear`, without its policy.  One part of the scene at a time is left out, made coarser, or added; the presses are
-of the same objects at the same places.  With a calibration of a GelSight Mini, as `sensors_io calibrate` makes it, depth
+of the same objects at the same places.  With a calibration of a GelSight Mini (`sensors_io calibrate` makes it), depth
 and slopes stand in the place of pictures, in both worlds.
 
 Development partitions of `physiclear` (its test partitions are not touched); intervals over objects, paired by video.
