@@ -1,12 +1,14 @@
-"""Pages of a run from the templates in `templates/`: self-contained, without scripts; text is escaped."""
+"""Pages of a run from the templates in `templates/`: self-contained, small, without scripts; text is escaped."""
 
 import base64
+import functools
 import itertools
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import cv2
 import jinja2
@@ -16,11 +18,18 @@ from experiments.core import curves
 from experiments.core.artifacts import write_bytes, write_text
 from experiments.core.context import read_metrics
 from experiments.core.look import marks
-from experiments.core.results import Cell, Column, Comparison, Results, Slot, Table
+from experiments.core.results import Cell, Column, Comparison, Results, RolloutExample, Slot, Table
 from experiments.core.text import MEANINGLESS, SMOKE, bounds, number, plain, preset_in_words
 from touchr1_jax.bench.scoring import REPORTED
 
 _FIGURES = re.compile(r"[-+−–\d\s.,:;%×()\[\]]{0,40}")  # more of them take several lines, as words do
+
+MOST_BYTES = 3_000_000  # of a page
+DETAILS = ((90, 1472), (75, 736), (50, 368), (20, 184))
+"""Quality and width in px, at most, of the photographs of a page, which shows a strip of frames 736 px wide.
+
+A page takes the first with which it keeps `MOST_BYTES`, else the last.
+"""
 
 
 ROWS = {
@@ -77,7 +86,8 @@ def write_report(directory: Path, results: Results, *, about: str, description: 
     for name, content in plots.items():
         write_bytes(directory / "plots" / name, content)
     measured = {name for row in (*results.arms.values(), *results.baselines.values()) for name in row}
-    page = render(
+    draw_page = functools.partial(
+        render,
         "report.jinja",
         about=about,
         description=description,
@@ -97,7 +107,12 @@ def write_report(directory: Path, results: Results, *, about: str, description: 
         compared_over=", ".join(dict.fromkeys(f"{c.n} {c.over}" for c in results.comparisons)),
         middle=middle,
         curves=drawn,
+        touches=touches(results.examples),
     )
+    for detail in DETAILS:
+        page = draw_page(detail=detail)
+        if len(page.encode()) <= MOST_BYTES:
+            break
     path = directory / "report.html"
     write_text(path, page)
     return path
@@ -173,26 +188,32 @@ def strip(frames: np.ndarray) -> np.ndarray:
     return np.concatenate(list(np.pad(frames, ((0, 0), (0, 0), (1, 1), (0, 0)), constant_values=255)), axis=1)
 
 
-def png(picture: np.ndarray) -> bytes:
-    """Encode a uint8 RGB picture [H, W, 3] without loss."""
-    return _encoded(picture, ".png")
-
-
-def jpeg(picture: np.ndarray) -> bytes:
-    """Encode a uint8 RGB picture [H, W, 3] in a tenth of the bytes, for pages with many frames."""
-    return _encoded(picture, ".jpg", cv2.IMWRITE_JPEG_QUALITY, 90, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111)
-
-
-def _encoded(picture: np.ndarray, kind: str, *options: int) -> bytes:
-    done, content = cv2.imencode(kind, np.ascontiguousarray(picture[..., ::-1]), options)
-    if not done:
-        raise ValueError(f"picture is {picture.dtype}{list(picture.shape)}: OpenCV cannot encode it; give uint8 RGB")
+def webp(picture: np.ndarray, quality: int = DETAILS[0][0], most_px: int = DETAILS[0][1]) -> bytes:
+    """Encode a uint8 RGB picture [H, W, 3], reduced to a width of `most_px`."""
+    height, width = picture.shape[:2]
+    if width > most_px:
+        size = most_px, max(1, round(height * most_px / width))
+        picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    _, content = cv2.imencode(".webp", np.ascontiguousarray(picture[..., ::-1]), (cv2.IMWRITE_WEBP_QUALITY, quality))
     return content.tobytes()
 
 
+def touches(examples: Iterable[RolloutExample]) -> list[tuple[str, list[list[RolloutExample]]]]:
+    """Neighbours of one group → for each contact the examples about it, so that a page shows its pictures once."""
+    groups = []
+    for name, members in itertools.groupby(examples, lambda example: example.group):
+        contacts: dict[Any, list[RolloutExample]] = {}
+        for one in members:
+            frames = tuple((sensor, seen.shape, seen.tobytes()) for sensor, seen in one.frames.items())
+            contacts.setdefault((one.object_id, frames), []).append(one)
+        groups.append((name, list(contacts.values())))
+    return groups
+
+
 def _data_uri(content: bytes, kind: str) -> str:
-    media = "svg+xml" if kind == "svg" else kind
-    return f"data:image/{media};base64,{base64.b64encode(content).decode()}"
+    if kind == "svg":  # as text, which is a fourth shorter than base64
+        return "data:image/svg+xml," + quote(content.replace(b"\n", b" "), safe=" ,;=/")
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def width_px(content: bytes, kind: str) -> float:
@@ -201,11 +222,6 @@ def width_px(content: bytes, kind: str) -> float:
         found = re.search(rb'<svg[^>]* width="([\d.]+)(pt)?"', content)
         return float(found[1]) * (96 / 72 if found[2] else 1) if found else 0.0
     return float(int.from_bytes(content[16:20]))  # in the first chunk of a PNG
-
-
-def _consecutive(every: Iterable[Any], attribute: str) -> list[tuple[str, list[Any]]]:
-    """Neighbours of one value of an attribute; jinja's own `groupby` sorts."""
-    return [(key, list(of)) for key, of in itertools.groupby(every, lambda one: getattr(one, attribute))]
 
 
 ENVIRONMENT = jinja2.Environment(
@@ -218,15 +234,13 @@ ENVIRONMENT = jinja2.Environment(
 ENVIRONMENT.filters |= {
     "bounds": lambda found, spec: bounds(found.low, found.high, spec),
     "cell": cell_text,
-    "consecutive": _consecutive,
     "data_uri": _data_uri,
-    "jpeg": jpeg,
     "indented": lambda value: json.dumps(value, indent=2, ensure_ascii=False),
     "number": number,
     "pieces": pieces,
     "plain": plain,
-    "png": png,
     "strip": strip,
+    "webp": webp,
     "width_px": width_px,
     "word_columns": word_columns,
 }

@@ -1,5 +1,6 @@
 """The report is one well-formed page that needs nothing from outside and trusts no text."""
 
+import base64
 import dataclasses
 import re
 from html.parser import HTMLParser
@@ -9,7 +10,15 @@ import pytest
 
 from experiments.core.artifacts import write_text
 from experiments.core.look import PALETTE, SYMBOLS
-from experiments.core.report import is_best, pieces, settings_in_words, word_columns, write_report
+from experiments.core.report import (
+    MOST_BYTES,
+    is_best,
+    pieces,
+    settings_in_words,
+    webp,
+    word_columns,
+    write_report,
+)
 from experiments.core.results import Comparison, Estimate, Picture, Results, Trace, named_table
 from experiments.core.text import MEANINGLESS, SMOKE, bounds, number, preset_in_words
 from tests.experiments.core.test_results import FAST, SLOW
@@ -254,9 +263,45 @@ def test_a_text_is_cut_at_its_segments():
     ]  # fmt: skip
 
 
+def rollouts(section: str) -> str:
+    """That section of a page."""
+    return section[section.index("A few rollouts") : section.index("Data and time")]
+
+
 def test_rollouts_of_a_group_fold_away_under_its_heading(tmp_path, results):
     examples = tuple(dataclasses.replace(coin.example(), group=group) for group in (HOSTILE, HOSTILE, "far off", ""))
-    page = write(tmp_path, dataclasses.replace(results, examples=examples))
-    page = page[page.index("A few rollouts") : page.index("Data and time")]
+    page = rollouts(write(tmp_path, dataclasses.replace(results, examples=examples)))
     found = [page.count(text) for text in ("<b>Question </b>", "<details", '<details open="open">', "<script")]
     assert found == [4, 2, 1, 0]
+    assert page.count("<img") == 3 * 2  # view and frames, once for each touch of a group
+
+
+def test_questions_about_one_touch_share_its_pictures(tmp_path, results):
+    pressed = {"xense": np.full((4, 8, 8, 3), 121, np.uint8)}
+    others = [{"frames": pressed}, {"question": "How rough is it?"}, {"frames": pressed}, {"object_id": "object_0008"}]
+    examples = (coin.example(), *(dataclasses.replace(coin.example(), **other) for other in others))
+    page = rollouts(write(tmp_path, dataclasses.replace(results, examples=examples)))
+    touches = [part.count("<b>Question </b>") for part in page.split("<article")[1:]]
+    assert touches == [2, 2, 1]
+    assert page.count("<img") == 2 * len(touches)
+
+
+@pytest.mark.long
+def test_a_page_stays_small_however_many_photographs_it_has(tmp_path, results):
+    """Of four sensors with eight frames of 224 px, as full of detail as no gel is."""
+    rng = np.random.default_rng(0)
+    strip, field = (rng.integers(0, 256, (2 * side, 2 * side, 3), np.uint8) for side in (224, 192))
+
+    def example(i: int):
+        frames = np.stack([strip[i : i + 224, f : f + 224] for f in range(8)])
+        fields = {f"gel_{s}": field[i : i + 192, :250] for s in range(4)}
+        own = {"frames": dict.fromkeys(fields, frames), "force_n": {}, "fields": fields, "view": strip[i:, i:]}
+        return dataclasses.replace(coin.example(), object_id=f"object_{i}", **own)
+
+    examples = tuple(map(example, range(12)))
+    page = write(tmp_path, dataclasses.replace(results, examples=examples))
+    assert len(page.encode()) <= MOST_BYTES
+    assert page.count("<img") >= 12 * 9
+    whole = base64.b64encode(webp(examples[0].fields["gel_0"])).decode()
+    assert whole not in page
+    assert whole in write(tmp_path, dataclasses.replace(results, examples=examples[:1]))

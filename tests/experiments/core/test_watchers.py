@@ -91,11 +91,11 @@ def test_curves_take_their_share_of_the_time_and_pages_stay_fresh(tmp_path, cons
     for step in range(700):
         context.log("grpo/paid/0", step, reward=0.5)
         pages += [shown(context)] * (shown(context) != pages[-1])
-        curves |= set(re.findall(r"base64,([^\"]*)", pages[-1]))
+        curves |= set(re.findall(r"data:image/([^\"]*)", pages[-1]))
     assert 700 // (PAGE_EVERY_S + 5) <= len(pages) <= 2 + 700 // PAGE_EVERY_S
     assert 1 <= len(curves) <= 1 + 700 * CURVES_SHARE
     page.end(RuntimeError("over"))
-    assert set(re.findall(r"base64,([^\"]*)", shown(context))) - curves  # the last page has all lines
+    assert set(re.findall(r"data:image/([^\"]*)", shown(context))) - curves  # the last page has all lines
     context.close()
 
 
