@@ -139,7 +139,8 @@ def requirements(config: ScaleConfig, lines: Lines, reserved: Reserved) -> tuple
     for setup, full in reserved.items():
         own = sum(lines[setup][name] for name in ARGUMENTS) + COUNTERS_BYTES
         found.append(at_most(f"{setup.name}: reserved for {config.compiler}", full.peak / GB, bound, "GB"))
-        found.append(at_most(f"{setup.name}: arguments off the count", abs(full.arguments / own - 1), 1e-3))
+        off = 100 * abs(full.arguments / own - 1)
+        found.append(at_most(f"{setup.name}: arguments, difference from the count", off, 0.1, "%"))
     return tuple(found)
 
 
@@ -170,7 +171,8 @@ def byte_table(lines: Lines) -> Table:
         "Counted by hand, GB on each device",
         rows,
         formats={setup.name: ".2f" for setup in lines},
-        note="LoRA: adapters of that rank on a frozen base.  Sampling and learning take turns: the larger counts.",
+        note="fsdp: devices over which parameters are divided, tensor: devices that share each layer.  LoRA: adapters "
+        "of that rank on a frozen base.  Sampling and learning take turns: the larger counts.",
     )
 
 
@@ -190,7 +192,9 @@ def memory_table(config: ScaleConfig, lines: Lines, reserved: Reserved) -> Table
             for setup, c in reserved.items()
         ],
         formats=dict.fromkeys(("arguments", "temporary", "peak", "counted"), ".2f"),
-        note="On a CPU the compiler multiplies bfloat16 as float32, layer by layer: an upper bound.",
+        note="An upper bound: on a CPU the compiler multiplies bfloat16 as float32."
+        if config.compiler == "cpu"
+        else "",
     )
 
 
@@ -213,7 +217,7 @@ def time_table(config: ScaleConfig) -> Table:
             f"Each phase takes what is longest of computing at {machine.flops_share:.0%} of {machine.flops / 1e12:.0f} "
             f"TFLOP/s, reading at {machine.read_share:.0%} of {machine.read_bytes / 1e12:.1f} TB/s and gathering at "
             f"{machine.link_share:.0%} of {machine.near_bytes / GB:.0f} GB/s inside a machine, "
-            f"{machine.far_bytes / GB:.0f} between machines.  A prediction: no step was timed on such a machine."
+            f"{machine.far_bytes / GB:.0f} GB/s between machines.  A prediction: no step was timed on such a machine."
         ),
     )
 

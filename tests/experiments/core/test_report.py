@@ -226,6 +226,12 @@ def test_pairs_of_a_metric_are_together_and_a_column_without_figures_is_left_out
     assert "Quantity" not in write(tmp_path, dataclasses.replace(results, data={"nested": {"a": 1}}))
 
 
+def test_requirements_without_notes_have_no_column_for_them(tmp_path, results):
+    noted = [dataclasses.replace(SLOW, note=note) for note in ("", "why")]
+    pages = [write(tmp_path, dataclasses.replace(results, requirements=(one,))) for one in noted]
+    assert ['<th class="text">Note</th>' in page for page in pages] == [False, True]
+
+
 def test_the_sign_of_zero_shows_in_an_interval_alone():
     assert [number(x, spec) for x, spec in ((-0.04, "+.1f"), (-0.04, ".1f"), (-0.06, ".1f"))] == ["+0.0", "0.0", "−0.1"]
     assert bounds(-0.04, 0.04, "+.1f") == "[−0.0, +0.0]"
