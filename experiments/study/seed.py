@@ -155,11 +155,11 @@ class StudySeed:
         config: SFTConfig,
         stage: str,
         contacts: EncodedContacts,
-        validation: Validation,
+        validation: Validation | None,
         params: Params,
         seed: int | None = None,
     ) -> Params:
-        """SFT of the decoder alone on encoded contacts, up to its best checkpoint; `seed` is that of the questions."""
+        """SFT of the decoder alone on encoded contacts; `validation` as in `run_grpo`, `seed` is of the questions."""
         policy, stage, seed = self.policy, f"{stage}/{self.seed}", self.seed if seed is None else seed
 
         def train() -> Params:
@@ -167,12 +167,13 @@ class StudySeed:
             clips = encoded_clips(contacts.features, np.arange(len(contacts.truth)), contacts.truth, **order)
             order |= {"questions": config.questions, "conclusion_weight": config.conclusion_weight}
             feed = AnswerFeed(policy, clips, contacts.evidence, **order)
-            with stage_hooks(self.context, stage, config.steps, scored=True) as hooks:
-                options: dict[str, Any] = {"seed": seed, "decoder_only": True, "held_out": self._judge(validation)}
+            with stage_hooks(self.context, stage, config.steps, scored=validation is not None) as hooks:
+                options: dict[str, Any] = {"seed": seed, "decoder_only": True}
+                options["held_out"] = None if validation is None else self._judge(validation)
                 return train_sft(policy, params, feed, config, hooks, **options)
 
         inputs = {**dataclasses.asdict(contacts.features), "truth": contacts.truth, "evidence": contacts.evidence}
-        arrays = {**params, "input": inputs, "validation": _named(validation)}
+        arrays = {**params, "input": inputs, "validation": {} if validation is None else _named(validation)}
         return self._shared("grpo", stage, train, {"config": config, "seed": seed}, arrays)
 
     def run_grpo(
@@ -209,7 +210,9 @@ class StudySeed:
         held = {} if validation is None else _named(validation)
         return self._shared("grpo", stage, train, values, {**params, "input": inputs, "validation": held})
 
-    def continued(self, config: SFTConfig, contacts: EncodedContacts, validation: Validation, params: Params) -> Params:
+    def continued(
+        self, config: SFTConfig, contacts: EncodedContacts, validation: Validation | None, params: Params
+    ) -> Params:
         """The control, which continues SFT of the decoder on other questions."""
         order = self.seed + CONTINUED_ORDER
         return self.run_decoder(config, f"decoder/{CONTINUED}", contacts, validation, params, order)
@@ -317,11 +320,11 @@ class SeedTraining(StudySeed):
         return params, contacts, validation
 
     def _continue(self, name: str, params: Params, contacts: EncodedContacts, validation: Validation) -> Params:
-        """The control or an arm, from what `_start` made."""
-        if name != CONTINUED:
-            judged = validation if self.config.recipe == "touch" else None
-            return self.run_grpo(self.arms[name], f"grpo/{name}", contacts, params, self.rollouts, judged)
-        return self.continued(self.config.continued, contacts, validation, params)
+        """The control or an arm, from what `_start` made; recipe `paper` takes the last checkpoint of each."""
+        judged = validation if self.config.recipe == "touch" else None
+        if name == CONTINUED:
+            return self.continued(self.config.continued, contacts, judged, params)
+        return self.run_grpo(self.arms[name], f"grpo/{name}", contacts, params, self.rollouts, judged)
 
     def _evaluate_arms(self) -> None:
         """SFT, its control and the arms; of seeds trained at the same time, one compiles what the other does not."""

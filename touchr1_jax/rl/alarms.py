@@ -88,7 +88,7 @@ def echo_excess(now: Metrics, start: Metrics) -> float | None:
 def grounding_size(now: Metrics, start: Metrics) -> float | None:
     """F3: mean grounding of a token, nat."""
     del start
-    return now["grounding"]
+    return now.get("grounding")
 
 
 def swap_blindness(now: Metrics, start: Metrics) -> float | None:
@@ -136,7 +136,7 @@ def idle_groups(now: Metrics, start: Metrics) -> float | None:
 
 def heavy_tail(now: Metrics, start: Metrics) -> float | None:
     """F8: the largest penalty of a token, β times its KL in units of the advantage, while answers get worse."""
-    return now["kl_cost_peak"] if now["accuracy"] < start["accuracy"] - WORSE else None
+    return now.get("kl_cost_peak") if now["accuracy"] < start["accuracy"] - WORSE else None
 
 
 def entropy_collapse(now: Metrics, start: Metrics) -> float | None:

@@ -71,8 +71,8 @@ def grpo_gradient(
       longest: `losses.divisor` of the whole batch, where this experience is a part of it.
 
     Returns:
-      The gradient; the loss and the mean of each of its parts over prompts (of a peak the largest); and the
-      log-probabilities that the ratios were taken to.
+      The gradient; the loss and the mean of each of its parts over prompts (of a peak the largest), without those of
+      weight 0, which are not computed; and the log-probabilities that the ratios were taken to.
     """
     algorithm = config.algorithm
     longest = divisor(config, experience.rollout.mask) if longest is None else longest
@@ -101,8 +101,11 @@ def grpo_gradient(
     grads, (by_prompt, old) = jax.lax.scan(add_micro_batch, zero, batches_of(config.micro_prompts, experience))
     over_prompts = lambda name: {"loss": jnp.sum}.get(name, jnp.max if name.endswith("_peak") else jnp.mean)
     parts = {name: over_prompts(name)(value) for name, value in by_prompt.items()}
-    parts["kl_cost_peak"] = loss_beta(algorithm) * parts["kl_peak"]
-    if not left_out(algorithm.gamma):
+    measured = {"kl": not left_out(loss_beta(algorithm)), "grounding": not left_out(algorithm.gamma)}
+    parts = {name: x for name, x in parts.items() if measured.get(name.removesuffix("_peak"), True)}
+    if measured["kl"]:
+        parts["kl_cost_peak"] = loss_beta(algorithm) * parts["kl_peak"]
+    if measured["grounding"]:
         parts |= _grounding_by_stream(in_order(by_prompt["grounding"]), experience)
     return grads, parts, in_order(old)
 

@@ -133,7 +133,7 @@ def test_the_kl_in_the_reward_is_a_term_of_it(lagging):
     np.testing.assert_allclose(metrics["reward_kl"], -0.1 * kl.mean(), rtol=1e-4)
     paid = jax.vmap(jax.vmap(lambda o, t: score(o, t)[0], (0, None)))(rollout.tokens, BATCH.target)
     np.testing.assert_allclose(metrics["reward"], metrics["reward_kl"] + np.mean(paid), rtol=1e-4)
-    assert metrics["kl"] == metrics["kl_cost_peak"] == 0
+    assert not {"kl", "kl_peak", "kl_cost_peak"} & metrics.keys()  # the loss computes none
 
 
 @pytest.mark.long
