@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from sensors_io.codec import encode_card
 from sensors_io.contents import Cards, convert
 from sensors_io.index import Index
-from sensors_io.records import write_lock
+from sensors_io.locks import write_lock
 from sensors_io.schema import ObjectCard, SchemaError
 from sensors_io.shards import ShardWriter, shard_file
 

@@ -15,9 +15,9 @@ import itertools
 import json
 import os
 import pathlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from collections.abc import Sequence as Seq
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
@@ -39,6 +39,8 @@ TABLES = ("contacts", "contact-shards", "objects", "object-shards")
 
 _OLD = (1, 2)  # everything in one JSON
 _BYTES = np.dtype("u1")
+
+_T = TypeVar("_T")
 
 
 class MissingIndexError(RecordsError):
@@ -117,7 +119,7 @@ class Index:
             damaged.
           RecordsError: it cannot be read.
         """
-        return cls.of(root, read_root(root)[0])
+        return settled(root, lambda tree, _: cls.of(root, tree))
 
     @classmethod
     def of(cls, root: Place, tree: Mapping[str, Any]) -> Self:
@@ -235,6 +237,21 @@ class Index:
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(root / INDEX)
+
+
+def settled(root: Place, opened: Callable[[dict[str, Any], str], _T]) -> _T:
+    """What `opened` makes of the root of an index and its digest, as `read_root` gives them.
+
+    Cards that are replaced go with their tables as soon as a new root names others: who had read the old one reads again.
+    """
+    found = read_root(root)
+    while True:
+        try:
+            return opened(*found)
+        except (RecordsError, OSError):
+            before, found = found, read_root(root)
+            if found == before:
+                raise
 
 
 def read_root(root: Place) -> tuple[dict[str, Any], str]:

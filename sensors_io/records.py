@@ -16,19 +16,19 @@ reads 5 to 12 times slower; WebP and FFV1 are at best a third smaller and read 2
 
 import dataclasses
 import datetime
-import fcntl
 import os
 import pathlib
 from collections.abc import Callable, Container, Iterable, Mapping
 from collections.abc import Sequence as Seq
 from types import TracebackType
-from typing import IO, Any, Self
+from typing import Any, Self
 
 import numpy as np
 
 from sensors_io.codec import CorruptRecordsError, RecordsError, decode_sequence, encode_card
 from sensors_io.contents import Cards, PartWriter, convert
-from sensors_io.index import INDEX, Index, MissingIndexError, Part, RecordsMeta, RecordsVersionError, read_root
+from sensors_io.index import INDEX, Index, MissingIndexError, Part, RecordsMeta, RecordsVersionError, read_root, settled
+from sensors_io.locks import RecordsExistError, write_lock
 from sensors_io.remote import at_url, place
 from sensors_io.schema import SPLITS, ContactKey, ObjectCard, SchemaError, Sequence
 from sensors_io.shards import Entries, ShardWriter, array_record_name, shard_file
@@ -40,7 +40,6 @@ __all__ = [
     "MissingIndexError",
     "RecordStore",
     "RecordWriter",
-    "RecordsBusyError",
     "RecordsError",
     "RecordsExistError",
     "RecordsMeta",
@@ -50,10 +49,6 @@ __all__ = [
 
 class IncompleteRecordsError(RecordsError):
     """Records whose writing stopped before the end."""
-
-
-class RecordsExistError(RecordsError):
-    """Records that are already there, or that somebody else is writing."""
 
 
 class RecordWriter:
@@ -247,7 +242,7 @@ class RecordStore:
 
     def __init__(self, path: str | os.PathLike[str], *, allow_incomplete: bool = False):
         self.path = place(path)
-        self._open(*read_root(self.path))
+        settled(self.path, self._open)
         if not self._index.complete and not allow_incomplete:
             raise IncompleteRecordsError(
                 f"{self.path} holds {len(self)} contacts and its writing has not ended; "
@@ -267,7 +262,14 @@ class RecordStore:
 
     def __setstate__(self, state: Any) -> None:
         self.path, *opened = state
-        self._open(*opened)  # as it was, though more may have been published since
+        try:
+            self._open(*opened)  # as it was, though more may have been published since
+        except CorruptRecordsError as error:
+            if read_root(self.path)[1] == self.digest:
+                raise
+            raise RecordsError(
+                f"{self.path}: its objects got other labels after it was opened; start again, to read those"
+            ) from error
 
     def __len__(self) -> int:
         return len(self.contacts)
@@ -334,30 +336,6 @@ class RecordStore:
         of = [card.split for card in self.objects.values()] if splits is None else splits
         chosen = np.array([one == split for one in of] or [False])[self.contacts.rows["object"]]
         return np.flatnonzero(chosen)
-
-
-class RecordsBusyError(RecordsExistError):
-    """Records that somebody else is writing."""
-
-
-def write_lock(root: pathlib.Path) -> IO[str]:
-    """An advisory lock on the directory, until it is closed or the process dies.
-
-    Raises:
-      RecordsBusyError: another process holds it.
-    """
-    file = (root / ".lock").open("w")
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        file.close()
-        raise RecordsBusyError(
-            f"{root} is being written by another process; wait for it or choose another path"
-        ) from error
-    except OSError:  # of a file system without locks
-        file.close()
-        raise
-    return file
 
 
 def _content(root: pathlib.Path, index: Index) -> str:

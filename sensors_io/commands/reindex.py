@@ -8,7 +8,7 @@ import tyro
 from sensors_io.commands.console import OUT
 from sensors_io.contents import convert
 from sensors_io.index import Index
-from sensors_io.records import write_lock
+from sensors_io.locks import write_lock
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

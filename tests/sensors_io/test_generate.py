@@ -10,7 +10,8 @@ import pytest
 
 from sensors_io import generate
 from sensors_io.codec import encode_sequence
-from sensors_io.records import RecordStore, write_lock
+from sensors_io.locks import write_lock
+from sensors_io.records import RecordStore
 from sensors_io.scenes.config import SceneConfig
 from tests.sensors_io import fakes
 

@@ -12,7 +12,8 @@ from sensors_io.__main__ import main
 from sensors_io.arrays import load_arrays
 from sensors_io.importers import hdf5_read, video
 from sensors_io.importers.keep import Keep
-from sensors_io.records import RecordsError, RecordStore, write_lock
+from sensors_io.locks import write_lock
+from sensors_io.records import RecordsError, RecordStore
 from tests.sensors_io import fakes
 from tests.sensors_io.checks import refused
 from tests.sensors_io.importers.films import film

@@ -12,7 +12,8 @@ from experiments.study import sources
 from experiments.study.dataset import split_parts
 from experiments.study.sources import SourceConfig, odd_contacts, prepare_records
 from sensors_io.importers.physiclear import PhysiclearConfig
-from sensors_io.records import RecordsBusyError, RecordWriter
+from sensors_io.locks import RecordsBusyError
+from sensors_io.records import RecordWriter
 from sensors_io.scenes.config import SceneConfig, config_hash
 from tests.experiments import tiny
 

@@ -1,12 +1,14 @@
 """Recorded objects get their labels from a table: what it says and nothing else, all of it or nothing."""
 
+import pickle
+
 import numpy as np
 import pytest
 
-from sensors_io import cards
+from sensors_io import cards, index
 from sensors_io.__main__ import main
 from sensors_io.cards import replace_cards
-from sensors_io.records import RecordStore
+from sensors_io.records import RecordsError, RecordStore
 from sensors_io.schema import SchemaError
 from tests.sensors_io import fakes
 from tests.sensors_io.checks import refused
@@ -90,3 +92,33 @@ def test_a_kill_before_the_index_leaves_the_old_cards(root, monkeypatch):
     assert RecordStore(root).objects["object_0"].labels == {"hardness": 1}
     said = r"object_id is 'object_7': .* holds object_0, object_1"
     refused(SchemaError, said, replace_cards, root, [fakes.card(7)])
+
+
+def labelled_while_read(root, monkeypatch):
+    """Have the objects labelled once, between reading the root of the index and what it names."""
+    read, left = index.read_root, [1]
+
+    def slow(path):
+        found = read(path)
+        if left:
+            left.pop()
+            replace_cards(root, [fakes.card(0, labels={"hardness": 2})])
+        return found
+
+    monkeypatch.setattr(index, "read_root", slow)
+
+
+def test_records_that_are_labelled_while_they_are_opened_are_not_called_damaged(root, monkeypatch):
+    labelled_while_read(root, monkeypatch)
+    assert RecordStore(root).objects["object_0"].labels == {"hardness": 2}
+    labelled_while_read(root, monkeypatch)
+    assert index.Index.read(root).objects == [f"object_{n}" for n in range(4)]
+
+
+def test_a_worker_that_opens_records_as_they_were_before_labels_says_so(root):
+    store = pickle.dumps(RecordStore(root))
+    replace_cards(root, [fakes.card(0)])
+    refused(RecordsError, "its objects got other labels after it was opened; start again", pickle.loads, store)
+    store = pickle.dumps(RecordStore(root))
+    next(root.glob("objects-*")).unlink()
+    refused(RecordsError, "is missing: copy it again from its source", pickle.loads, store)
