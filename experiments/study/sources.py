@@ -13,8 +13,8 @@ from experiments.core.context import Context
 from experiments.core.progress import ProgressCallback
 from sensors_io.generate import generate_records
 from sensors_io.importers.physiclear import PhysiclearConfig, import_physiclear
-from sensors_io.quality import oddities
 from sensors_io.locks import RecordsBusyError
+from sensors_io.quality import oddities
 from sensors_io.records import RecordStore
 from sensors_io.scenes.config import SceneConfig, config_hash
 

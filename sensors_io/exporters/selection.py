@@ -13,16 +13,17 @@ import os
 import pathlib
 import shutil
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, TypeVar
 
 import numpy as np
 
+from sensors_io.codec import encode_sequence
 from sensors_io.contents import put_rest_pictures, rest_pictures
 from sensors_io.errors import MALFORMED, UserError
 from sensors_io.index import RecordsMeta
 from sensors_io.json_files import seal, unseal
-from sensors_io.records import RecordStore, RecordWriter
+from sensors_io.records import RecordsExistError, RecordStore, RecordWriter
 from sensors_io.schema import FRAME_ARRAYS, ContactKey, ObjectCard, Sequence
 
 FORMAT = "touchr1-export"
@@ -154,6 +155,10 @@ def _checksum(arrays: Mapping[str, Any]) -> int:
     return crc
 
 
+def _encoded(contact: Iterable[Sequence]) -> dict[str, bytes]:
+    return {sequence.sensor: encode_sequence(sequence) for sequence in contact}
+
+
 def _require_same(plain: dict[str, Any], arrays: Mapping[str, Any], what: str) -> None:
     if plain.pop(ARRAYS, None) not in (None, _checksum(arrays)):
         raise ExportError(
@@ -232,7 +237,7 @@ def write_back(path: pathlib.Path, found: FoundExport, out: pathlib.Path, progre
 
     Raises:
       ExportError: a part of it is damaged or missing.
-      RecordsExistError: `out` holds other records.
+      RecordsExistError: `out` holds other records, or another contact or gel at rest under the same name.
     """
     differ = {
         name for name, data in found.rests.items() if found.head.rests.get(name, zlib.crc32(data)) != zlib.crc32(data)
@@ -241,6 +246,9 @@ def write_back(path: pathlib.Path, found: FoundExport, out: pathlib.Path, progre
         raise ExportError(f"{path}: the gel at rest in {lost[0]} is missing or damaged; export the records again")
     sequences = 0
     with RecordWriter(out, meta=found.head.meta, resume=True) as writer:
+        there, rests = RecordStore(out, allow_incomplete=True) if writer.contacts_done else None, rest_pictures(out)
+        for name in found.rests.keys() & rests.keys():
+            _require_same(rests[name] == found.rests[name], f"the gel at rest {name}", out, path)
         put_rest_pictures(out, found.rests)
         for card in found.cards:
             if card.object_id not in writer.objects_done:
@@ -248,12 +256,26 @@ def write_back(path: pathlib.Path, found: FoundExport, out: pathlib.Path, progre
         for done, contact in enumerate(_read(path, found.contacts), 1):
             if not contact:
                 raise ExportError(f"{path}: contact {done} holds no sequence; export the records again")
-            if contact[0].key not in writer:
+            if there is not None and (number := there.contacts.find(contact[0].key)) is not None:
+                same = _encoded(there.contact(number).values()) == _encoded(contact)
+                _require_same(same, contact[0].name, out, path)
+            else:
                 writer.write_contact(contact)
             sequences += len(contact)
             progress(done, found.count)
         if found.head.sequences not in (None, sequences):
             raise ExportError(f"{path} holds {sequences} of {found.head.sequences} sequences; export the records again")
+
+
+def _encoded(contact: Iterable[Sequence]) -> dict[str, bytes]:
+    return {sequence.sensor: encode_sequence(sequence) for sequence in contact}
+
+
+def _require_same(same: bool, what: str, out: pathlib.Path, path: pathlib.Path) -> None:
+    if not same:
+        raise RecordsExistError(
+            f"{out} holds another {what} than {path}: records of one name are of one recording; choose another one"
+        )
 
 
 def _read(path: pathlib.Path, parts: Iterator[_T]) -> Iterator[_T]:
@@ -281,13 +303,22 @@ def published(out: pathlib.Path) -> Iterator[pathlib.Path]:
     Raises:
       ExportError: `out` is there already.
     """
+    there = ExportError(f"--out is {out}: must not exist yet; name another path, or move it away")
     if out.exists():
-        raise ExportError(f"--out is {out}: must not exist yet; name another path, or move it away")
+        raise there
     out.parent.mkdir(parents=True, exist_ok=True)
     temporary = out.with_name(f".{out.name}.{os.getpid()}.tmp")
     try:
         yield temporary
-        temporary.replace(out)
+        try:
+            if temporary.is_file():
+                os.link(temporary, out)  # a file that moves replaces another one; a folder does not
+            else:
+                temporary.rename(out)
+        except OSError:
+            if out.exists():  # written meanwhile, by another process
+                raise there from None
+            temporary.replace(out)  # a file system without links
     finally:
         if temporary.is_dir():
             shutil.rmtree(temporary)

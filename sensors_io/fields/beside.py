@@ -5,6 +5,7 @@ import functools
 import hashlib
 import json
 import pathlib
+import zlib
 from collections.abc import Callable, Iterator
 
 from sensors_io.contents import put_rest_pictures, rest_pictures
@@ -51,7 +52,7 @@ class FieldsJob:
             )
 
     def hash(self, digest: str) -> str:
-        """First 16 hex digits of the SHA-256 of the job and of the digest of its records."""
+        """First 16 hex digits of the SHA-256 of the job and of the digest of its records and their gels at rest."""
         background = b"" if self.gel.background is None else self.gel.background.tobytes()
         made_by = "" if self.calibration is None else self.calibration.hash
         said = [digest, self.sensor, made_by, self.gel.rest_frames, self.gel.mm_per_px, self.rows]
@@ -85,10 +86,11 @@ def fields_beside(
     if out.absolute() == job.records.absolute():
         raise CalibrationError(f"--out is {out}: must not be the records themselves; name another directory")
     _try_first(store, job)
+    rests = rest_pictures(store.path)
     meta = RecordsMeta(
         source=store.meta.source,
         licence=store.meta.licence,
-        config_hash=job.hash(store.digest),
+        config_hash=job.hash(" ".join([store.digest, *(f"{name} {zlib.crc32(x)}" for name, x in rests.items())])),
         sensors=store.meta.sensors,
         notes={**store.meta.notes, "fields": {"of": job.sensor, "records": store.digest, "rows": job.rows}},
     )
@@ -96,6 +98,7 @@ def fields_beside(
     per_shard = max(1, frames_per_shard // each)
 
     def units_from(contacts: int, shards: int) -> list[WorkUnit]:
+        put_rest_pictures(out, rests)  # not before: `out` may hold other records
         units = []
         for number, first in enumerate(range(contacts, len(store), per_shard), shards):
             last = min(first + per_shard, len(store))
@@ -105,7 +108,6 @@ def fields_beside(
             units.append(WorkUnit(name=name, run=run, done=part_path(out.absolute(), name).exists))
         return units
 
-    put_rest_pictures(out, rest_pictures(store.path))
     cards = store.objects.values()
     write_by_units(out, meta, cards, units_from, launcher, lambda done: progress(done, len(store)))
 

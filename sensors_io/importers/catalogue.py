@@ -19,11 +19,12 @@ from sensors_io.importers.gel import NO_GEL, SourceGel
 from sensors_io.importers.holdout import split_by_name
 from sensors_io.importers.keep import ImportSourceError, Shares, Skip, UnreadableError, at_height
 from sensors_io.importers.pictures import read_picture
-from sensors_io.records import RecordsMeta, RecordWriter
+from sensors_io.index import INDEX, Index
+from sensors_io.records import RecordsExistError, RecordsMeta, RecordWriter
 from sensors_io.schema import ATTRIBUTES, SPLITS, UNKNOWN, ContactKey, ObjectCard, Sequence
 
 _VIEW_ROWS = 240  # of a stored view: twice what a clip shows
-_NOTE = "left_out"
+_NOTE, _IDENTITY = "left_out", "identity"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -113,7 +114,7 @@ def import_catalogue(
 
     Raises:
       ImportSourceError: no contact of the source can be read, or a gel for several sensors.
-      RecordsExistError: `out` holds other records.
+      RecordsExistError: `out` holds other records, or the source changed since they were imported.
     """
     gel.require_one_sensor(catalogue.sensors)
     meta = RecordsMeta(
@@ -121,8 +122,9 @@ def import_catalogue(
         licence=catalogue.licence,
         config_hash=gel.identity(catalogue.identity),
         sensors=catalogue.sensors,
-        notes={"config": catalogue.config},
+        notes={"config": catalogue.config, _IDENTITY: catalogue.identity},
     )
+    _require_same_files(out, meta)
     with RecordWriter(out, meta=meta, resume=True) as writer:
         gel.store(out)
         run = _Run(writer, catalogue, gel, dict(writer.notes.get(_NOTE, {})))
@@ -136,6 +138,18 @@ def import_catalogue(
             raise ImportSourceError(f"{catalogue.source}: no contact can be read; the first: {first}")
         writer.note(report=dataclasses.asdict(report))
     return report
+
+
+def _require_same_files(out: pathlib.Path, meta: RecordsMeta) -> None:
+    """Refuse to go on with a source that changed, in words that tell this from other options."""
+    if not (out / INDEX).is_file():
+        return
+    before, now = Index.read(out).meta.notes, json.loads(json.dumps(meta.notes))
+    if _IDENTITY in before and before[_IDENTITY] != now[_IDENTITY] and before["config"] == now["config"]:
+        raise RecordsExistError(
+            f"{out} was imported with these options when the source had other files: the name, size or time of change "
+            f"of one differs, or a table; choose another directory, or delete {out} to import it anew"
+        )
 
 
 @dataclasses.dataclass
@@ -193,19 +207,27 @@ class _Run:
 
 
 def fingerprint(root: pathlib.Path, files: Seq[pathlib.Path], config: Any, listings: Seq[pathlib.Path] = ()) -> str:
-    """Hash of everything that decides what is imported: config, names and sizes of the files, content of the listings.
+    """Hash of everything that decides what is imported: config, names, sizes and times of the files, whole listings.
 
     Args:
-      root: directory of the source; where it lies does not matter.
+      root: directory of the source; where it lies does not matter, as long as a copy keeps the times of its files.
       files: recordings and pictures, below `root`; one that is absent counts as such.
       config: a dataclass.
       listings: tables and labels, read whole.
     """
-    sizes = [(f.relative_to(root).as_posix(), f.stat().st_size if f.is_file() else None) for f in files]
-    digest = hashlib.sha256(json.dumps([type(config).__name__, dataclasses.asdict(config), sizes]).encode())
+    states = [(f.relative_to(root).as_posix(), *_state(f)) for f in files]
+    digest = hashlib.sha256(json.dumps([type(config).__name__, dataclasses.asdict(config), states]).encode())
     for listing in listings:
         digest.update(listing.read_bytes())
     return digest.hexdigest()[:16]
+
+
+def _state(file: pathlib.Path) -> tuple[int, ...]:
+    """Bytes and time of the last change of a file; none of one that is absent."""
+    if not file.is_file():
+        return ()
+    found = file.stat()
+    return found.st_size, found.st_mtime_ns
 
 
 def require_files(root: pathlib.Path, found: Seq[Any], expected: str) -> None:

@@ -17,7 +17,7 @@ from sensors_io.exporters import selection
 from sensors_io.exporters.arrays import export_arrays
 from sensors_io.exporters.exported import import_exported
 from sensors_io.exporters.lerobot import export_lerobot
-from sensors_io.exporters.selection import ExportError, Selected
+from sensors_io.exporters.selection import ExportError, Selected, published
 from sensors_io.records import IncompleteRecordsError, MissingIndexError, RecordsExistError, RecordStore, RecordWriter
 from tests.sensors_io import fakes
 from tests.sensors_io.checks import refused
@@ -79,6 +79,44 @@ def test_every_array_and_time_comes_back_equal(tmp_path, kind):
     import_exported(out, back, SILENT)  # once more changes nothing
     equal(RecordStore(records), RecordStore(back))
     refused(RecordsExistError, "already", import_exported, out, fakes.write(tmp_path / "other", 1), SILENT)
+
+
+def test_another_recording_of_the_same_sensors_is_not_mixed_in(tmp_path):
+    """All recordings of a sensor have one hash of their config; objects, sites and trials begin anew in each."""
+    pytest.importorskip("h5py")
+    for name, at_rest, length in (("a", b"a", 3), ("b", b"a", 4), ("c", b"another", 3)):
+        with RecordWriter(tmp_path / name, meta=fakes.META) as writer:
+            writer.write_object(fakes.card(0))
+            writer.write_contact([fakes.sequence(0, "xense", length=length)])
+        put_rest_pictures(tmp_path / name, {"rest.png": at_rest})
+        export("hdf5", tmp_path / name, tmp_path / f"{name}.h5")
+    out = tmp_path / "out"
+    import_exported(tmp_path / "a.h5", out, SILENT)
+    said = "holds another {} than .*records of one name are of one recording; choose another one"
+    refused(RecordsExistError, said.format("object_0.*xense"), import_exported, tmp_path / "b.h5", out, SILENT)
+    refused(RecordsExistError, said.format("gel at rest rest.png"), import_exported, tmp_path / "c.h5", out, SILENT)
+    import_exported(tmp_path / "a.h5", out, SILENT)
+    equal(RecordStore(tmp_path / "a"), RecordStore(out))
+    assert rest_pictures(out) == {"rest.png": b"a"}
+
+
+@pytest.mark.parametrize("as_folder", [True, False])
+def test_an_export_replaces_none_that_another_process_wrote_meanwhile(tmp_path, as_folder):
+    def write(path, text):
+        if as_folder:
+            path.mkdir()
+            path /= "file"
+        path.write_text(text)
+
+    def twice(out):
+        with published(out) as mine:
+            write(mine, "mine")
+            write(out, "the other's")
+
+    out = tmp_path / "out"
+    refused(ExportError, "must not exist yet", twice, out)
+    assert (out / "file" if as_folder else out).read_text() == "the other's"
+    assert list(tmp_path.iterdir()) == [out]
 
 
 @pytest.mark.parametrize("kind", ["zarr", "hdf5"])

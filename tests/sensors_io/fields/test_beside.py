@@ -16,7 +16,7 @@ from sensors_io.fields.beside import FieldsJob, fields_beside
 from sensors_io.fields.extract import ExtractConfig, Extractor
 from sensors_io.fields.recorded import RecordedGels, RestGel, recorded_fields
 from sensors_io.fields.types import CalibrationError
-from sensors_io.records import RecordStore, RecordWriter
+from sensors_io.records import RecordsExistError, RecordStore, RecordWriter
 from sensors_io.schema import Flag
 from tests.sensors_io import fakes
 from tests.sensors_io.checks import refused
@@ -87,6 +87,19 @@ def test_a_gel_with_markers_gives_all_fields_and_an_estimated_force(tmp_path):
     measured = written(tmp_path / "measured", 1, frames=frames, force_n=np.full((3, 3), -1.5, np.float32))
     fields_beside(job(measured, **coarse), tmp_path / "kept")
     assert (RecordStore(tmp_path / "kept").contact(0)["gelsight_mini"].force_n == -1.5).all()
+
+
+def test_the_gel_at_rest_of_other_records_stays(tmp_path):
+    """It is written behind the lock and the check, and belongs to what an extraction is known by."""
+    records, other = written(tmp_path / "records", 1), written(tmp_path / "other", 1)
+    for path, content in ((records, b"a picture"), (other, b"another")):
+        put_rest_pictures(path, {"rest.png": content})
+    refused(RecordsExistError, "made by config", fields_beside, job(records), other)
+    assert rest_pictures(other) == {"rest.png": b"another"}
+    fields_beside(job(records), tmp_path / "out")
+    put_rest_pictures(records, {"rest.png": b"another"})
+    refused(RecordsExistError, "made by config", fields_beside, job(records), tmp_path / "out")
+    assert rest_pictures(tmp_path / "out") == {"rest.png": b"a picture"}
 
 
 @pytest.mark.parametrize("when", ["before a part", "after a part"])

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import os
 
 import numpy as np
 import pytest
@@ -89,7 +90,7 @@ def test_nothing_readable_is_an_error_and_leaves_nothing(tmp_path):
     refused(RecordsExistError, "made by config 'c0ffee', not 'abcd'", import_catalogue, other, tmp_path)
 
 
-def test_the_fingerprint_is_of_config_names_sizes_and_listings(tmp_path):
+def test_the_fingerprint_is_of_config_names_sizes_times_and_listings(tmp_path):
     def now(config=Keep()):  # noqa: B008
         return fingerprint(tmp_path, [tmp_path / "a", tmp_path / "gone"], config, [tmp_path / "list"])
 
@@ -104,7 +105,9 @@ def test_the_fingerprint_is_of_config_names_sizes_and_listings(tmp_path):
     (tmp_path / "a").write_bytes(b"22")
     third = now()
     (tmp_path / "gone").write_bytes(b"")
-    assert len({first, second, third, now()}) == 4
+    fourth = now()
+    os.utime(tmp_path / "a", ns=(0, 1))
+    assert len({first, second, third, fourth, now()}) == 5
 
 
 def test_bad_options_are_named():

@@ -5,10 +5,13 @@ import shutil
 
 import pytest
 
+from sensors_io.importers.catalogue import import_catalogue
 from sensors_io.importers.keep import ImportSourceError
 from sensors_io.importers.label_table import LabelsError
 from sensors_io.importers.videos import VideosConfig, list_videos
+from sensors_io.records import RecordsExistError
 from sensors_io.schema import MATERIALS
+from tests.sensors_io.checks import refused
 from tests.sensors_io.importers.films import film, imported, picture
 
 TABLE = """clip,object_id,hardness,roughness,material,split
@@ -103,3 +106,25 @@ def test_a_table_that_labels_nothing_or_twice_is_refused(tmp_path, table, said):
     (tmp_path / "labels.csv").write_text(table)
     with pytest.raises(LabelsError, match=said):
         list_videos(tmp_path, VideosConfig(sensor="digit", labels=tmp_path / "labels.csv"))
+
+
+def test_a_clip_that_changed_at_the_same_size_is_not_mixed_in(clips, tmp_path):
+    """Neither while an interrupted import goes on nor afterwards."""
+
+    def interrupt(done, total):
+        if done == 2:
+            raise KeyboardInterrupt
+
+    out, changed = tmp_path / "records", clips / "sponge" / "frame_9.png"
+    listing = lambda: list_videos(clips, VideosConfig(sensor="gelsight_mini"))
+    with pytest.raises(KeyboardInterrupt):
+        import_catalogue(listing(), out, progress=interrupt)
+    before = changed.stat()
+    changed.write_bytes(changed.read_bytes()[::-1])
+    said = "imported with these options when the source had other files: .*time of change"
+    refused(RecordsExistError, said, import_catalogue, listing(), out)
+    changed.write_bytes(changed.read_bytes()[::-1])
+    os.utime(changed, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert import_catalogue(listing(), out).contacts == 6
+    changed.touch()
+    refused(RecordsExistError, said, import_catalogue, listing(), out)
