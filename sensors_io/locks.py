@@ -12,7 +12,7 @@ class RecordsExistError(RecordsError):
 
 
 class RecordsBusyError(RecordsExistError):
-    """Records that somebody else is writing."""
+    """Records, or pictures for a calibration, that somebody else is writing."""
 
 
 def write_lock(root: pathlib.Path) -> IO[str]:

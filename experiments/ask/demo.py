@@ -3,6 +3,7 @@
 import contextlib
 import http.server
 import re
+import socket
 import tempfile
 import threading
 import urllib.parse
@@ -13,6 +14,7 @@ from typing import ClassVar
 from experiments.ask.answers import ask_policy
 from experiments.ask.inputs import GENERATED, read_touch
 from experiments.ask.page import answered_part
+from experiments.core.errors import DataError
 from experiments.core.report import ENVIRONMENT
 from sensors_io.errors import UserError
 from sensors_io.viewer.server import LimitedServer, names_this_machine, split_target
@@ -21,6 +23,9 @@ from touchr1_jax.text.plain_questions import QuestionError
 
 MOST_BYTES = 200 * 2**20
 """Size of a video that is taken."""
+
+PART_BYTES = 2**20
+"""So much of a video is in memory while it comes."""
 
 SILENT_S = 30.0
 """A connection that sends nothing for so long is closed."""
@@ -76,17 +81,11 @@ class DemoHandler(http.server.BaseHTTPRequestHandler):
             return
         length = self.headers.get("Content-Length", "")
         if split.path != "/video" or not re.fullmatch("[0-9]{1,12}", length) or int(length) > MOST_BYTES:
-            self.close_connection = True
             self._reply(f"a video of at most {MOST_BYTES // 2**20} MB is expected", status=413)
-            while self.rfile.read1(2**20):  # to close while it comes would reset the connection, and lose the answer
-                pass
-            return
-        video = self.rfile.read(int(length))
-        if len(video) < int(length):
-            self._reply(f"the video was cut off, {len(video)} bytes of {length}; send it again", status=400)
+            self._take_rest()
             return
         suffix = re.search(r"\.[A-Za-z0-9]{1,7}$", asked.get("name", ""))
-        self._answer(lambda: self._of_video(video, suffix[0] if suffix else "", asked.get("sensor", "")))
+        self._answer(lambda: self._of_video(int(length), suffix[0] if suffix else "", asked.get("sensor", "")))
 
     def log_message(self, format: str, *args: object) -> None:
         """Keep the terminal free."""
@@ -99,20 +98,37 @@ class DemoHandler(http.server.BaseHTTPRequestHandler):
         self.send_error(403, "open the address that the program printed")
         return False
 
-    def _of_video(self, video: bytes, suffix: str, sensor: str) -> str:
+    def _of_video(self, length: int, suffix: str, sensor: str) -> str:
+        """The answers about the next `length` bytes, which go to a file as they come: memory holds a part of them."""
         with tempfile.TemporaryDirectory() as home:
-            path = Path(home) / f"video{suffix}"
-            path.write_bytes(video)
+            path, left = Path(home) / f"video{suffix}", length
+            with path.open("wb") as file:
+                while left and (part := self.rfile.read(min(left, PART_BYTES))):
+                    file.write(part)
+                    left -= len(part)
+            if left:
+                raise DataError(f"the video was cut off, {length - left} bytes of {length}; send it again")
             return self.demo.answer(path, sensor)
+
+    def _take_rest(self) -> None:
+        """End the answer, then take what still comes: to close meanwhile would reset the connection, and lose it."""
+        with contextlib.suppress(OSError):
+            self.connection.shutdown(socket.SHUT_WR)
+            while self.rfile.read1(PART_BYTES):
+                pass
 
     def _answer(self, answer: Callable[[], str]) -> None:
         try:
             text, status = answer(), 200
         except (UserError, QuestionError) as error:
             text, status = str(error), 400
+        except TimeoutError:
+            text, status = f"nothing came of the video for {SILENT_S:g} s; send it again", 408
         except OSError as error:
             text, status = f"the video could not be kept ({error}): free some space in TMPDIR of the program", 507
         self._reply(text, status)
+        if status != 200:
+            self._take_rest()
 
     def _reply(self, text: str, status: int = 200) -> None:
         content = text.encode()

@@ -120,8 +120,8 @@ def point_latest(directory: Path) -> None:
 
 
 @contextlib.contextmanager
-def locked(directory: Path) -> Iterator[None]:
-    """Lock a run directory for this process, until it ends; `RunInUse` if another process has locked it."""
+def locked(directory: Path, otherwise: str = "start a new run with --fresh") -> Iterator[None]:
+    """Lock the directory of a run for this process, until it ends; `RunInUse` if another process has locked it."""
     with (directory / ".lock").open("w") as file:
         while True:
             try:
@@ -131,7 +131,7 @@ def locked(directory: Path) -> Iterator[None]:
                 if _in_use(directory):  # else somebody looks whether it is, and is done in a moment
                     raise RunInUse(
                         f"{directory} is in use by another process: two would overwrite each other; "
-                        "wait for it, stop it, or start a new run with --fresh"
+                        f"wait for it, stop it, or {otherwise}"
                     ) from None
         yield
 

@@ -106,9 +106,11 @@ class SweepCommand:
             return 2
         run = run_sweep if self.launcher.here else functools.partial(launch_sweep, self.launcher, package)
         try:
-            require_growth(folder, self.name, units)
-            return run(experiment, about, folder, units, self.figures)
-        except (SweepError, DamagedFileError) as error:
+            folder.mkdir(parents=True, exist_ok=True)
+            with runs.locked(folder, "give another folder by --into"):
+                require_growth(folder, self.name, units)
+                return run(experiment, about, folder, units, self.figures)
+        except (SweepError, DamagedFileError, runs.RunInUse, OSError) as error:
             print_error(f"{type(error).__name__}: {error}")
             return 1
 
@@ -262,7 +264,6 @@ def _list_units(experiment: Experiment[Any], about: str, folder: Path, units: Se
     """Write `sweep.json`; the scale of the runs."""
     scale: str = parse(experiment, units[0].command, about).scale
     listed = [{"hash": u.digest, "settings": u.settings, "command": u.command, "config": u.config} for u in units]
-    folder.mkdir(parents=True, exist_ok=True)
     write_sealed(folder / LIST, {"experiment": experiment.name, "scale": scale, "units": listed})
     return scale
 

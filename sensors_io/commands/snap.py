@@ -18,6 +18,7 @@ from sensors_io.devices.base import Device
 from sensors_io.devices.errors import DeviceNotFoundError, DeviceTimeoutError, StreamEndedError
 from sensors_io.fields.sources import read_picture
 from sensors_io.fields.types import CalibrationError, write_whole
+from sensors_io.locks import write_lock
 from sensors_io.viewer.server import LiveView, Numbers
 
 _TIMEOUT_S = 2.0  # for one frame
@@ -53,6 +54,8 @@ class Snap(Bench):
                     f"mm_per_px is {pitch}, ball_diameter_mm {self.ball_diameter_mm:g}: both must be > 0; measure them "
                     "(mm_per_px: width of the gel that the picture shows over its pixels)"
                 )
+            self.out.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(write_lock(self.out))
             live = stack.enter_context(LiveView(port=self.port))
             OUT.print(f"guidance at {live.address}, Ctrl-C ends", highlight=False)
             guide, said = self._guide(pitch), ""

@@ -86,7 +86,10 @@ function draw() {
   });
 }
 const source = new EventSource('/numbers');
-source.onerror = () => { $('alarm').textContent = 'the view has ended'; };
+source.onerror = () => {
+  const refused = source.readyState == EventSource.CLOSED;
+  $('alarm').textContent = refused ? 'no more connections: close other tabs, load again' : 'the view has ended';
+};
 source.onmessage = event => {
   const s = JSON.parse(event.data);
   $('title').textContent = document.title = s.title;

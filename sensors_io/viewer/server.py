@@ -6,6 +6,7 @@ has time for: one that is slow skips some instead of falling behind, and any num
 connections that browsers open to one server.
 """
 
+import contextlib
 import dataclasses
 import http.cookies
 import http.server
@@ -28,7 +29,8 @@ from sensors_io.viewer.panels import Panel
 
 _QUALITY = 85  # of the pictures' JPEG; recordings are lossless, a view need not be
 _CONNECTIONS = 64
-"""Open at once: ten browsers with their six, and what is half open; more are closed at once."""
+"""Open at once: ten browsers with their six, and what is half open; more are told so and closed at once."""
+_FULL = f"{_CONNECTIONS} connections are open, and no more are served: close other tabs of this page, and load it again"
 _SILENT_S = 10.0  # a connection that sends or takes nothing for so long is closed
 _WAIT_S = 1.0  # how long a stream that has nothing new waits before it looks whether the view has ended
 
@@ -173,11 +175,14 @@ class LimitedServer(http.server.ThreadingHTTPServer):
         self._free = threading.Semaphore(_CONNECTIONS)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Close a connection too many instead of giving it a thread."""
+        """Refuse a connection too many instead of giving it a thread."""
         if self._free.acquire(blocking=False):
             super().process_request(request, client_address)
-        else:
-            self.shutdown_request(request)
+            return
+        kept = f"Content-Type: text/plain; charset=utf-8\r\nContent-Length: {len(_FULL)}\r\nConnection: close"
+        with contextlib.suppress(OSError):
+            request.sendall(f"HTTP/1.1 503 Service Unavailable\r\n{kept}\r\n\r\n{_FULL}".encode())
+        self.shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Say nothing of a connection that the other side broke off."""

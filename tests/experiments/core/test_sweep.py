@@ -6,7 +6,7 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.core.runner import main
-from experiments.core.runs import locate
+from experiments.core.runs import locate, locked
 from experiments.core.sweep import SweepError, plan
 from experiments.core.sweep import main as sweep
 from experiments.core.sweep_figures import chart, chosen_figures
@@ -137,3 +137,17 @@ def test_figures_that_all_runs_have_are_chosen_and_drawn():
     finished = [({"a": v}, {"x acc": estimate(1), "requirement: speed": 2.0}) for v in ("1", "100")]
     assert chart(finished, ["x acc", "requirement: speed"]).startswith(b"<?xml")
     assert chart([({"a": v}, of) for v, (_, of) in zip(("one", "two"), finished, strict=True)], ["x acc"])
+
+
+def test_two_sweeps_at_once_do_not_write_into_one_folder(workplace, capsys):
+    """They would train each run twice, end with errors where they meet, and replace each other's list and page."""
+    Path("mine").mkdir()
+    arguments = ("coin", "--vary", "seeds=2,3", "--steps", "1", "--into", "mine")
+    with locked(Path("mine")):
+        assert sweep(arguments, package=FAKES) == 1
+    said = "RunInUse: mine is in use by another process: two would overwrite each other; wait for it, stop it, or give"
+    assert said in capsys.readouterr().err
+    assert [path.name for path in Path("mine").iterdir()] == [".lock"]
+    Path("file").touch()
+    assert sweep((*arguments[:-1], "file"), package=FAKES) == 1
+    assert "Error: " in capsys.readouterr().err

@@ -5,12 +5,14 @@ import pathlib
 import numpy as np
 import pytest
 
+from sensors_io.__main__ import main
 from sensors_io.calibration.guide import Guidance, GuideConfig, PressGuide
 from sensors_io.calibration.presses import BallPresses
-from sensors_io.commands.snap import Snap
+from sensors_io.commands.snap import Snap, _write
 from sensors_io.devices.replay import ReplayConfig
 from sensors_io.fields.sources import read_picture
 from sensors_io.fields.types import CalibrationError
+from sensors_io.locks import write_lock
 from tests.sensors_io.calibration.synthetic import press_ball, spread_touches
 
 TOUCHES = spread_touches(10)
@@ -92,3 +94,14 @@ def test_pictures_of_another_size_are_named(tmp_path: pathlib.Path, presses: Bal
 def test_a_share_beyond_one_is_never_covered() -> None:
     with pytest.raises(ValueError, match=r"cover is 1\.1: must be ≤ 1"):
         GuideConfig(cover=1.1)
+
+
+def test_two_sessions_do_not_take_their_pictures_into_one_folder(tmp_path, presses, capsys):
+    """Each would overwrite the gel at rest that the presses of the other are compared with."""
+    _write(tmp_path / "1.png", presses.background)
+    (tmp_path / "out").mkdir()
+    with write_lock(tmp_path / "out"):
+        words = ["--out", str(tmp_path / "out"), "--ball-diameter-mm", "4", "--mm-per-px", "0.1", "--port", "0"]
+        assert main(["snap", *words, "replay", "--path", str(tmp_path / "1.png")]) == 1
+    assert "is being written by another process; wait for it or choose another path" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "out").iterdir()] == [".lock"]

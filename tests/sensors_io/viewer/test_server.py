@@ -169,13 +169,15 @@ def test_streams_end_with_the_view_and_a_taken_port_is_an_error():
 
 
 @pytest.mark.long
-def test_connections_too_many_are_closed():
+def test_connections_too_many_are_told_so_and_closed():
     with LiveView(port=0) as view:
         port = int(urllib.parse.urlsplit(view.address).port)
         before = threading.active_count()
         silent = [socket.create_connection(("127.0.0.1", port), timeout=10) for _ in range(100)]
         for connection in silent[64:]:
-            assert connection.recv(1) == b""
+            answer = b"".join(iter(lambda c=connection: c.recv(65_536), b""))
+            assert answer.startswith(b"HTTP/1.1 503 ")
+            assert b"64 connections are open, and no more are served: close other tabs" in answer
         assert threading.active_count() - before <= 64
         for connection in silent:
             connection.close()
