@@ -373,6 +373,7 @@ def _compute(
         write_sealed(directory / "results.json", results.to_json(description))  # last: it marks the run as finished
         runs.point_latest(directory)  # of a run without a loop or a line
     except BaseException as error:
-        page.end(error)
+        with contextlib.suppress(Exception):  # of the page must not hide what ended the run
+            page.end(error)
         raise
     print_lines(f"report: {report}", *(results.verdict if command.scale != SMOKE else (f"{MEANINGLESS}.",)))

@@ -105,7 +105,8 @@ class LivePage(Watcher):
         """Write the last page of a session that an error or a signal ended: the cause, and how to continue."""
         why = f"{type(error).__name__}: {error}".rstrip(": ")
         command = continuing(self._description["command"])
-        self._draw()
+        with contextlib.suppress(Exception):  # the signal may have struck while Matplotlib was imported
+            self._draw()
         self._write(f"Ended on {_now()} by {why}. To continue: {command}", reload_s=None)
 
     def write_if_due(self, *, curves: bool = True) -> None:

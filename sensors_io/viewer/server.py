@@ -166,12 +166,24 @@ class LiveView:
 
 
 class LimitedServer(http.server.ThreadingHTTPServer):
-    """A thread for each connection, of which there are so many at most."""
+    """A thread for each connection, of which there are so many at most.
+
+    Args:
+      address: host and port to serve at.
+      handler: of requests.
+
+    Raises:
+      OSError: the port is taken, or may not be.
+    """
 
     request_queue_size = _CONNECTIONS
 
-    def __init__(self, *args: Any):
-        super().__init__(*args)
+    def __init__(self, address: tuple[str, int], handler: type[http.server.BaseHTTPRequestHandler]):
+        try:
+            super().__init__(address, handler)
+        except OSError as error:
+            told = f"{error.strerror}: {address[0]}:{address[1]}; name another --port, or 0 for a free one"
+            raise OSError(error.errno, told) from error
         self._free = threading.Semaphore(_CONNECTIONS)
 
     def process_request(self, request: Any, client_address: Any) -> None:

@@ -143,11 +143,33 @@ def read_adapted(
 
 
 def read_saved(folder: Path, weights: Path | None = None) -> SavedPolicy:
-    """A policy of either format.
+    """A policy of either format; again if its folder was replaced meanwhile, so that files of two are never mixed.
 
     Raises:
       PolicyError, WeightsError: as `read_policy` and `read_adapted`, or weights for a policy that has its own.
     """
+    while True:
+        before = _state(folder)
+        try:
+            found = _read_either(folder, weights)
+        except (WeightsError, OSError):
+            if _state(folder) == before:
+                raise
+        else:
+            if _state(folder) == before:
+                return found
+
+
+def _state(folder: Path) -> tuple[int, ...]:
+    """What another folder in the same place differs in; nothing where there is none."""
+    try:
+        found = folder.stat()
+    except OSError:
+        return ()
+    return found.st_dev, found.st_ino, found.st_mtime_ns
+
+
+def _read_either(folder: Path, weights: Path | None) -> SavedPolicy:
     if format_of(folder) == ADAPTED:
         return read_adapted(folder, weights)
     if weights is not None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.core import runs
+from experiments.core import runs, watchers
 from experiments.core.artifacts import read_json
 from experiments.core.runner import Experiment, main, parse, run_experiment
 from tests.experiments.fakes import coin
@@ -170,6 +170,15 @@ def test_options_of_a_choice_stand_anywhere(arguments, expected):
 def test_the_scale_chooses_the_defaults_that_overrides_change(arguments, scale, steps):
     command = parse(coin.EXPERIMENT, arguments, "about")
     assert (command.scale, command.config.steps) == (scale, steps)
+
+
+def test_a_page_that_cannot_be_written_does_not_hide_what_ended_the_run(monkeypatch):
+    def full(page, error):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(watchers.LivePage, "end", full)
+    monkeypatch.setattr(coin, "train", lambda *options: signal.raise_signal(signal.SIGTERM))
+    assert run("coin") == 143
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

@@ -2,6 +2,7 @@
 
 import itertools
 import re
+import signal
 import struct
 import sys
 from types import SimpleNamespace
@@ -10,9 +11,11 @@ from unittest.mock import Mock, call
 import pytest
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 
+from experiments.core import watchers
 from experiments.core.context import Context, MetricLog
 from experiments.core.progress import TrainingSample
 from experiments.core.runner import main
+from experiments.core.stopping import Stopped
 from experiments.core.watchers import CURVES_SHARE, PAGE_EVERY_S, SAMPLES, TENSORBOARD, WANDB, Events, LivePage
 from tests.experiments.core.test_report import DESCRIPTION, HOSTILE, read
 
@@ -96,6 +99,16 @@ def test_curves_take_their_share_of_the_time_and_pages_stay_fresh(tmp_path, cons
     assert 1 <= len(curves) <= 1 + 700 * CURVES_SHARE
     page.end(RuntimeError("over"))
     assert set(re.findall(r"data:image/([^\"]*)", shown(context))) - curves  # the last page has all lines
+    context.close()
+
+
+def test_the_last_page_tells_what_ended_a_run_though_its_curves_cannot_be_drawn(tmp_path, console, monkeypatch):
+    """As after a signal while Matplotlib was imported: the run ended with the error of its half-made classes."""
+    page, context = watched(tmp_path, console, Clock())
+    context.log("grpo/paid/0", 0, reward=0.5)
+    monkeypatch.setattr(watchers, "draw_phases", lambda *lines, **options: {}["Rectangle:kwdoc"])
+    page.end(Stopped(signal.SIGTERM))
+    assert "by Stopped: SIGTERM. To continue: python -m experiments coin" in read(shown(context)).text
     context.close()
 
 

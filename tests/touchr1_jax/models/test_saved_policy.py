@@ -5,6 +5,7 @@ import dataclasses
 import hashlib
 import json
 from pathlib import Path
+from unittest.mock import Mock
 
 import jax
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 from experiments.faults.trainings.small_study import MODEL
 from tests.touchr1_jax.drawn import draw_params
 from touchr1_jax.asking import load_policy
-from touchr1_jax.models import saved_policy
+from touchr1_jax.models import adapted_folder, saved_policy
 from touchr1_jax.models.qwen.safetensors import read_header, read_tensor, write_file
 from touchr1_jax.models.saved_policy import PolicyError, PolicyInput, SavedPolicy, published, read_policy, save_policy
 from touchr1_jax.models.touch_policy import build_policy, touch_shapes
@@ -296,3 +297,26 @@ def test_a_policy_that_cannot_be_replaced_stays(saved, folder, monkeypatch):
         save_policy(folder, saved, precision="int8")
     assert {p.name: p.read_bytes() for p in folder.iterdir()} == before
     assert [p.name for p in folder.parent.iterdir()] == ["policy"]
+
+
+@pytest.mark.parametrize("notices", [True, False])
+def test_a_policy_that_is_replaced_while_it_is_read_is_read_again(tmp_path, monkeypatch, notices):
+    def put(name):
+        with published(tmp_path / "policy", ("config.json",)) as unfinished:
+            (unfinished / "config.json").write_text(name)
+
+    def read(folder):
+        config = (folder / "config.json").read_text()
+        if config == "old":
+            put("new")
+        parameters = (folder / "config.json").read_text()
+        if notices and parameters != config:
+            raise PolicyError("model.safetensors is missing or damaged; copy the folder again")
+        return config, parameters
+
+    monkeypatch.setattr(adapted_folder, "read_policy", read)
+    put("old")
+    assert adapted_folder.read_saved(tmp_path / "policy") == ("new", "new")
+    monkeypatch.setattr(adapted_folder, "read_policy", Mock(side_effect=PolicyError("damaged")))
+    with pytest.raises(PolicyError, match="damaged"):
+        adapted_folder.read_saved(tmp_path / "policy")
