@@ -240,7 +240,7 @@ class Index:
 
 
 def settled(root: Place, opened: Callable[[dict[str, Any], str], _T]) -> _T:
-    """What `opened` makes of the root of an index and its digest, as `read_root` gives them.
+    """Open the root of an index by a function of what `read_root` gives; its value.
 
     Cards that are replaced go with their tables as soon as a new root names others: who read the old one reads again.
     """

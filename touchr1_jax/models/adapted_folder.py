@@ -161,7 +161,7 @@ def read_saved(folder: Path, weights: Path | None = None) -> SavedPolicy:
 
 
 def _state(folder: Path) -> tuple[int, ...]:
-    """What another folder in the same place differs in; nothing where there is none."""
+    """Marks in which another folder in the same place differs; nothing where there is none."""
     try:
         found = folder.stat()
     except OSError:

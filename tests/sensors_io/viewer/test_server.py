@@ -159,7 +159,7 @@ def test_numbers_that_json_does_not_know_are_null():
 def test_streams_end_with_the_view_and_a_taken_port_is_an_error():
     with LiveView(port=0) as view:
         port = int(urllib.parse.urlsplit(view.address).port)
-        with pytest.raises(OSError, match="in use: 127.*; name another --port"), LiveView(port=port):
+        with pytest.raises(OSError, match=r"in use: 127.*; name another --port"), LiveView(port=port):
             pass
         view.publish({}, NUMBERS)
         events = ask(view, "numbers")
