@@ -155,10 +155,6 @@ def _checksum(arrays: Mapping[str, Any]) -> int:
     return crc
 
 
-def _encoded(contact: Iterable[Sequence]) -> dict[str, bytes]:
-    return {sequence.sensor: encode_sequence(sequence) for sequence in contact}
-
-
 def _require_same(plain: dict[str, Any], arrays: Mapping[str, Any], what: str) -> None:
     if plain.pop(ARRAYS, None) not in (None, _checksum(arrays)):
         raise ExportError(
@@ -248,7 +244,7 @@ def write_back(path: pathlib.Path, found: FoundExport, out: pathlib.Path, progre
     with RecordWriter(out, meta=found.head.meta, resume=True) as writer:
         there, rests = RecordStore(out, allow_incomplete=True) if writer.contacts_done else None, rest_pictures(out)
         for name in found.rests.keys() & rests.keys():
-            _require_same(rests[name] == found.rests[name], f"the gel at rest {name}", out, path)
+            _require_own(rests[name] == found.rests[name], f"gel at rest {name}", out, path)
         put_rest_pictures(out, found.rests)
         for card in found.cards:
             if card.object_id not in writer.objects_done:
@@ -258,7 +254,7 @@ def write_back(path: pathlib.Path, found: FoundExport, out: pathlib.Path, progre
                 raise ExportError(f"{path}: contact {done} holds no sequence; export the records again")
             if there is not None and (number := there.contacts.find(contact[0].key)) is not None:
                 same = _encoded(there.contact(number).values()) == _encoded(contact)
-                _require_same(same, contact[0].name, out, path)
+                _require_own(same, contact[0].name, out, path)
             else:
                 writer.write_contact(contact)
             sequences += len(contact)
@@ -271,7 +267,7 @@ def _encoded(contact: Iterable[Sequence]) -> dict[str, bytes]:
     return {sequence.sensor: encode_sequence(sequence) for sequence in contact}
 
 
-def _require_same(same: bool, what: str, out: pathlib.Path, path: pathlib.Path) -> None:
+def _require_own(same: bool, what: str, out: pathlib.Path, path: pathlib.Path) -> None:
     if not same:
         raise RecordsExistError(
             f"{out} holds another {what} than {path}: records of one name are of one recording; choose another one"
