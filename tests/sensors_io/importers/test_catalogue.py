@@ -86,7 +86,7 @@ def test_nothing_readable_is_an_error_and_leaves_nothing(tmp_path):
     refused(ImportSourceError, said, import_catalogue, broken, tmp_path)
     assert not (tmp_path / "index.json").exists()
     import_catalogue(catalogue(), tmp_path)
-    other = dataclasses.replace(catalogue(), identity="abcd")
+    other = dataclasses.replace(catalogue(), identity="abcd", config={"height": 8})
     refused(RecordsExistError, "made by config 'c0ffee', not 'abcd'", import_catalogue, other, tmp_path)
 
 
