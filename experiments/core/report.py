@@ -111,7 +111,7 @@ def write_report(directory: Path, results: Results, *, about: str, description: 
     )
     for detail in DETAILS:
         page = draw_page(detail=detail)
-        if len(page.encode()) <= MOST_BYTES:
+        if len(page.encode(errors="surrogateescape")) <= MOST_BYTES:
             break
     path = directory / "report.html"
     write_text(path, page)
