@@ -194,7 +194,10 @@ def webp(picture: np.ndarray, quality: int = DETAILS[0][0], most_px: int = DETAI
     if width > most_px:
         size = most_px, max(1, round(height * most_px / width))
         picture = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-    _, content = cv2.imencode(".webp", np.ascontiguousarray(picture[..., ::-1]), (cv2.IMWRITE_WEBP_QUALITY, quality))
+    options = cv2.IMWRITE_WEBP_QUALITY, quality
+    done, content = cv2.imencode(".webp", np.ascontiguousarray(picture[..., ::-1]), options)
+    if not done:
+        raise ValueError(f"picture is {picture.dtype}{list(picture.shape)}: OpenCV cannot encode it; give uint8 RGB")
     return content.tobytes()
 
 

@@ -30,7 +30,7 @@ from experiments.core.errors import ConfigurationError
 from experiments.core.results import Picture, Results, Table, named_table
 from experiments.core.runner import Experiment
 from experiments.core.text import bounds, interval
-from experiments.recordings.cross_validation import FORMATS, UNITS, CrossValidation, deal_folds, intervals
+from experiments.recordings.cross_validation import FORMATS, UNITS, CrossValidation, deal_folds, intervals, scores
 from experiments.recordings.descriptions import DescribedVideos, auxiliary_data, describe_scenes, describe_source
 from experiments.recordings.findings import JudgedAnswers, gains
 from experiments.recordings.learning import LearnConfig
@@ -281,35 +281,54 @@ def negative(gain: Interval) -> Interval:
     return dataclasses.replace(gain, mean=-gain.mean, low=-gain.high, high=-gain.low)
 
 
-def scored(found: JudgedAnswers) -> dict[str, Any]:
-    """Cells of a table: the scores, mean over the partitions."""
-    return {name: one.mean for name, one in intervals(found.levels, found.truth, found.owner).items()}
+def gain_table(
+    title: str,
+    found: Mapping[str, JudgedAnswers],
+    gained: Mapping[str, Interval],
+    cost: Mapping[str, float],
+    over: str,
+    *,
+    of: str,
+    costs: str,
+    unit: str,
+    spec: str,
+    meaning: str,
+    note: str,
+) -> Table:
+    """The scores of every entry, mean over the partitions, its gain over one of them, and its cost.
+
+    `of` and `costs` are the names of the first and the last column; unit, format and meaning are of the last.
+    """
+    rows = []
+    for name, one in found.items():
+        row: dict[str, Any] = {of: name, **{k: x.mean() for k, x in scores(one.levels, one.truth).items()}}
+        gain = gained.get(name)
+        row["gain"] = None if gain is None else gain.mean
+        row["95 %"] = None if gain is None else bounds(gain.low, gain.high, "+.1f")
+        row[costs] = cost.get(name)
+        rows.append(row)
+    return named_table(
+        title,
+        rows,
+        formats={**FORMATS, "gain": "+.1f", costs: spec},
+        units={**UNITS, "gain": "points", costs: unit},
+        meanings={
+            "gain": f"of the mean over '{over}', paired by video",
+            "95 %": "of the gain, over objects",
+            costs: meaning,
+        },
+        note=note,
+    )
 
 
 def part_table(
     parts: Mapping[str, JudgedAnswers], lost: Mapping[str, Interval], milliseconds: Mapping[str, float]
 ) -> Table:
     """All variants of the scenes."""
-    rows = []
-    for name, found in parts.items():
-        gain = lost.get(name)
-        row: dict[str, Any] = {"scenes": name, **scored(found)}
-        row["gain"] = None if gain is None else gain.mean
-        row["95 %"] = None if gain is None else bounds(gain.low, gain.high, "+.1f")
-        row["a press"] = milliseconds.get(name)
-        rows.append(row)
-    return named_table(
-        "Parts of a scene",
-        rows,
-        formats={**FORMATS, "gain": "+.1f", "a press": ".0f"},
-        units={**UNITS, "gain": "points", "a press": "ms"},
-        meanings={
-            "gain": f"of the mean over '{AS_GENERATED}', paired by video",
-            "95 %": "of the gain, over objects",
-            "a press": "processor time to generate and describe one, compilation included",
-        },
-        note="Probes alone, on the partitions that settings were chosen on.",
-    )
+    meaning = "processor time to generate and describe one, compilation included"
+    note = "Probes alone, on the partitions that settings were chosen on."
+    last: dict[str, Any] = {"costs": "a press", "unit": "ms", "spec": ".0f", "meaning": meaning}
+    return gain_table("Parts of a scene", parts, lost, milliseconds, AS_GENERATED, of="scenes", **last, note=note)
 
 
 def part_picture(changed: Mapping[str, Interval]) -> Picture:
@@ -326,26 +345,11 @@ def part_picture(changed: Mapping[str, Interval]) -> Picture:
 
 def input_table(inputs: Mapping[str, JudgedAnswers], seconds: Mapping[str, float]) -> Table:
     """Pictures, fields and both."""
-    rows = []
-    for name, found in inputs.items():
-        row: dict[str, Any] = {"input": name, **scored(found)}
-        gain = None if name == PICTURES else gains(found, inputs[PICTURES])["mean"]
-        row["gain"] = None if gain is None else gain.mean
-        row["95 %"] = None if gain is None else bounds(gain.low, gain.high, "+.1f")
-        row["a video"] = seconds[name]
-        rows.append(row)
-    return named_table(
-        "Pictures and fields",
-        rows,
-        formats={**FORMATS, "gain": "+.1f", "a video": ".2f"},
-        units={**UNITS, "gain": "points", "a video": "s"},
-        meanings={
-            "gain": f"of the mean over '{PICTURES}', paired by video",
-            "95 %": "of the gain, over objects",
-            "a video": "median processor time to read and describe its frames after decoding",
-        },
-        note="Fields are depth and its slopes by a calibration; 'course' is how the change grows and fades.",
-    )
+    gained = {name: gains(found, inputs[PICTURES])["mean"] for name, found in inputs.items() if name != PICTURES}
+    meaning = "median processor time to read and describe its frames after decoding"
+    note = "Fields are depth and its slopes by a calibration; 'course' is how the change grows and fades."
+    last: dict[str, Any] = {"costs": "a video", "unit": "s", "spec": ".2f", "meaning": meaning}
+    return gain_table("Pictures and fields", inputs, gained, seconds, PICTURES, of="input", **last, note=note)
 
 
 def input_picture(inputs: Mapping[str, JudgedAnswers], seconds: Mapping[str, float]) -> Picture:
