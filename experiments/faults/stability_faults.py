@@ -17,6 +17,7 @@ waits below 2 % of a step.
 
 import dataclasses
 import tempfile
+import textwrap
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -270,7 +271,7 @@ def report(
             flip_table(flips),
             named_table(
                 "Bad inputs",
-                [{**row, "answer": row["answer"][:CELL], "faults": row["faults"] or "none"} for row in inputs],
+                [{**row, "answer": shortened(row["answer"]), "faults": row["faults"] or "none"} for row in inputs],
                 meanings={"faults": "what the answer lacks, and what was lost or left half-written"},
             ),
             waiting_table(waited),
@@ -278,6 +279,11 @@ def report(
         pictures=(kill_picture(killed),),
         settings={"kills": sum(len(k.kills) for k in killed.values()), "bad inputs": len(inputs)},
     )
+
+
+def shortened(message: str) -> str:
+    """A message for a table: whole words, and "…" for those that are left out."""
+    return textwrap.shorten(message, CELL, placeholder=" …")
 
 
 def kill_table(killed: Mapping[str, KilledRuns]) -> Table:
@@ -298,7 +304,7 @@ def kill_table(killed: Mapping[str, KilledRuns]) -> Table:
 def damage_table(damage: Sequence[Damage]) -> Table:
     """Ends by kind of file and damage, with the first message of each kind."""
     ends = Counter((f"{one.file}, {one.damage}", one.outcome) for one in damage)
-    message = {f"{one.file}, {one.damage}": one.message[:CELL] for one in reversed(damage)}
+    message = {f"{one.file}, {one.damage}": shortened(one.message) for one in reversed(damage)}
     return named_table(
         "Damaged files of a resumed run",
         [

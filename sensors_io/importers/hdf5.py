@@ -12,14 +12,14 @@ import fnmatch
 import functools
 import pathlib
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from sensors_io.importers.catalogue import Catalogue, Listed, fingerprint, require_files
 from sensors_io.importers.hdf5_map import ArrayMap, LayoutMap, ValueMap, read_map
-from sensors_io.importers.hdf5_read import HDF5Error, Place, bounds, dataset, h5py, named, opened, read_contact
+from sensors_io.importers.hdf5_read import HDF5Error, Place, bounds, dataset, h5py, named, opened, read_contact, spelled
 from sensors_io.importers.holdout import split_by_name
 from sensors_io.importers.keep import ImportConfig, ImportSourceError, Skip
 from sensors_io.schema import ATTRIBUTES, MATERIALS, ContactKey, ObjectCard, SchemaError
@@ -62,6 +62,8 @@ def list_hdf5(source: pathlib.Path, config: HDF5Config) -> Catalogue:
         except HDF5Error as error:
             skipped.append(Skip(name=path.name, reason=str(error)))
             continue
+        if not facts:
+            skipped.append(Skip(name=path.name, reason=f"no group fits contact {layout.contact!r}; see `--inspect`"))
         for place, key, card in facts:
             if cards.setdefault(key.object_id, card) != card:
                 skipped.append(Skip(name=place.name, reason=f"labels object {key.object_id!r} unlike an earlier one"))
@@ -72,8 +74,6 @@ def list_hdf5(source: pathlib.Path, config: HDF5Config) -> Catalogue:
             trials[stated] = key.trial + 1
             read = functools.partial(read_contact, place, key, layout, config)
             contacts[key] = Listed(key=key, name=place.name, read=read)
-    if not contacts and not skipped:
-        raise ImportSourceError(f"{source}: no group fits contact {layout.contact!r}; see `--inspect` for the groups")
     splits = split_by_name(cards, val_share=config.val_share, test_share=config.test_share)
     labelled = tuple(a for a in ATTRIBUTES if a in layout.labels)
     return Catalogue(
@@ -134,7 +134,7 @@ def _facts(file: Any, place: Place, layout: LayoutMap, annotator: str) -> tuple[
         object_id = _plain_name(str(value("object_id", place.name)))
         whole = {name: _whole(value(name, 0), name) for name in ("site", "trial")}
         key = ContactKey(object_id=object_id, motion=str(value("motion", "free")), **whole)
-        labels = {a: _level(a, _stated(file, place, of, a)) for a, of in layout.labels.items()}
+        labels = {a: _level(a, _stated(file, place, of, a), of.names) for a, of in layout.labels.items()}
         name = object_id.replace("_", " ")
         return key, ObjectCard(object_id=object_id, split="train", labels=labels, annotator=annotator, name=name)
     except SchemaError as error:
@@ -172,7 +172,12 @@ def _whole(value: Any, name: str) -> int:
     return whole
 
 
-def _level(attribute: str, value: Any) -> int:
+def _level(attribute: str, value: Any, names: Mapping[str, int] | None) -> int:
+    if names is not None:
+        said = spelled(value)
+        if said not in names:
+            raise HDF5Error(f"{attribute} is {said!r:.60}: the names of the mapping lack it")
+        return names[said]
     if attribute == "material" and str(value) in MATERIALS:
         return MATERIALS.index(str(value))
     return _whole(value, attribute)

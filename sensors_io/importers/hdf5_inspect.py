@@ -1,7 +1,7 @@
 """Contents of an HDF5 file as lines of text, and a mapping of them to begin with.
 
 The proposal goes by names, shapes and stated units.  What it cannot know it writes as "?", which `read_map` refuses by
-name, so that nobody imports a guess about a unit.
+name, so that nobody imports a guess about a unit or about the order of levels.
 """
 
 import pathlib
@@ -13,12 +13,18 @@ from typing import Any
 import numpy as np
 
 from sensors_io.importers.hdf5_map import QUANTITIES, UNITS
-from sensors_io.importers.hdf5_read import SPELLED, STATED, h5py, named, opened
-from sensors_io.schema import SENSORS
+from sensors_io.importers.hdf5_read import SPELLED, STATED, h5py, named, opened, spelled
+from sensors_io.schema import ATTRIBUTES, LEVELS, MATERIALS, SENSORS
 
 UNKNOWN_UNIT = "?"
 DEEPEST = 3
 """Groups above a contact that a proposal looks through."""
+
+SHOWN = 5
+"""Names of groups that a listing gives of those with equal contents."""
+
+MOST_NAMES = 20
+"""Values from which on what carries an attribute's name is no label."""
 
 NAMES: Mapping[str, str] = {
     "depth_mm": "depth|height|indent",
@@ -26,13 +32,13 @@ NAMES: Mapping[str, str] = {
     "deformation_mm": "deform|displac",
     "moment_nmm": "moment|torque",
     "force_n": "force|wrench|ft",
-    "host_time_ns": "time|stamp|^ts?$",
+    "host_time_ns": "time|stamp|clock|^ts?$",
 }
 """Array of the schema → pattern of the last part of a path."""
 
 
 def describe(path: pathlib.Path) -> tuple[str, ...]:
-    """A line for each group and data set; groups of equal contents are listed once and counted.
+    """A line for each group and data set; of groups with equal contents one is listed, and others are named.
 
     Raises:
       HDF5Error: it is damaged.
@@ -68,15 +74,43 @@ def propose(path: pathlib.Path) -> dict[str, Any]:
         for stream in sensors.values():
             if "host_time_ns" not in stream:
                 stream["rate_hz"] = UNKNOWN_UNIT
-        named = next((a for a in group.attrs if "object" in a.lower()), None)
+        named = next((a for a in group.attrs if re.search("object|sample|specimen|item", a.lower())), None)
         object_id = {"object_id": {"attribute": named}} if named else {}
-        return {"source": path.parent.name, "licence": "?", "contact": pattern, **object_id, "sensors": sensors}
+        labels = {a: label for a in ATTRIBUTES if (label := _label(a, file, group)) is not None}
+        head = {"source": path.parent.name, "licence": "?", "contact": pattern, **object_id}
+        return {**head, **({"labels": labels} if labels else {}), "sensors": sensors}
+
+
+def _label(attribute: str, file: Any, group: Any) -> dict[str, Any] | None:
+    """The attribute or data set of a contact that seems to be this label, and all that the file says there."""
+    above = group
+    while above.name != "/" and not any(attribute in a.lower() for a in above.attrs):
+        above = above.parent
+    in_attributes = [a for a in above.attrs if attribute in a.lower()]
+    in_arrays = [n for n, data in _datasets(group) if attribute in n.lower() and data.ndim < 2]
+    if not in_attributes and not in_arrays:
+        return None
+    values: set[str] = set()
+
+    def gather(name: str, item: Any) -> None:
+        if in_attributes and in_attributes[0] in item.attrs:
+            values.add(spelled(item.attrs[in_attributes[0]]))
+        elif not in_attributes and f"/{name}".endswith(f"/{in_arrays[0]}"):
+            values.update(spelled(x) for x in np.ravel(item[()]))
+
+    gather("", file)
+    file.visititems(gather)
+    of = {"attribute": in_attributes[0]} if in_attributes else {"path": in_arrays[0]}
+    plain = {str(level) for level in range(LEVELS[attribute])} | set(MATERIALS if attribute == "material" else ())
+    if len(values) > MOST_NAMES:
+        return None
+    return of if values <= plain else {**of, "names": dict.fromkeys(sorted(values), UNKNOWN_UNIT)}
 
 
 def _lines(group: Any, indent: str) -> Iterator[str]:
     for name, value in group.attrs.items():
         yield f"{indent}@{name} = {value!s:.60}"
-    seen: Counter[tuple[Any, ...]] = Counter()
+    seen: dict[tuple[Any, ...], list[str]] = {}
     for name, item in group.items():
         named(name)
         if isinstance(item, h5py().Dataset):
@@ -86,14 +120,15 @@ def _lines(group: Any, indent: str) -> Iterator[str]:
         if not isinstance(item, h5py().Group):
             yield f"{indent}{name}  (broken link)" if item is None else f"{indent}{name}  (named type)"
             continue
-        contents = _contents(item)
-        seen[contents] += 1
-        if seen[contents] == 1:
+        alike = seen.setdefault(tuple((n, str(data.dtype), data.shape[1:]) for n, data in _datasets(item)), [])
+        alike.append(name)
+        if len(alike) == 1:
             yield f"{indent}{name}/"
             yield from _lines(item, indent + "  ")
-    more = sum(seen.values()) - len(seen)
-    if more:
-        yield f"{indent}… and {more} groups of the same contents"
+    for first, *others in seen.values():
+        if others:
+            listed = ", ".join(others[:SHOWN]) + (f" … {others[-1]}" if len(others) > SHOWN else "")
+            yield f"{indent}… with the arrays of {first}: {listed}"
 
 
 def _contents(group: Any) -> tuple[Any, ...]:

@@ -4,7 +4,10 @@
       "source": "TouchReason", "licence": "CC BY 4.0",
       "contact": "/trials/*",
       "object_id": {"attribute": "object"}, "motion": {"value": "press"},
-      "labels": {"hardness": {"path": "labels/hardness"}},
+      "labels": {
+        "hardness": {"path": "labels/hardness"},
+        "material": {"attribute": "made of", "names": {"steel": "metal", "oak": "wood", "?": -1}}
+      },
       "sensors": {
         "gelsight_mini": {
           "frames": {"path": "gelsight/rgb"},
@@ -17,7 +20,7 @@
     }
 
 `contact` is a pattern of groups, each one contact; "/" takes a file for one.  A path is relative to that group, or to
-the file with a leading "/".
+the file with a leading "/".  A label is a level, or a name of a material; `names` turns what a file says into these.
 """
 
 import dataclasses
@@ -27,7 +30,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from sensors_io.importers.keep import LEAST_HZ, MOST_HZ, ImportSourceError
-from sensors_io.schema import ATTRIBUTES
+from sensors_io.schema import ATTRIBUTES, LEVELS, MATERIALS, UNKNOWN
 
 UNITS: Mapping[str, Mapping[str, float]] = {
     "picture": {"": 1.0, "1": 255.0},
@@ -106,10 +109,14 @@ class ArrayMap:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ValueMap:
-    """A value of a contact: an `attribute` of its group or one above, the `path` of a number or text, or a `value`."""
+    """A value of a contact: an `attribute` of its group or one above, the `path` of a number or text, or a `value`.
+
+    `names` gives the level of each text or number that a file may say.
+    """
 
     kind: str
     value: Any
+    names: Mapping[str, int] | None = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -154,7 +161,7 @@ def read_map(path: pathlib.Path) -> LayoutMap:
         licence=root.text("licence", "all rights reserved"),
         contact=root.text("contact", "/"),
         values={name: _value(root.part(name)) for name in _VALUES if name in root.found},
-        labels={name: _value(labels.part(name)) for name in labels.found},
+        labels={name: _label(labels.part(name), name) for name in labels.found},
         sensors={name: _stream(sensors.part(name)) for name in sensors.found},
     )
 
@@ -197,21 +204,37 @@ class _Entry:
             raise ImportSourceError(f"{self.name}: {key} is {value!r:.60}: must be true or false; correct it")
         return value
 
-    def one_of(self, *keys: str) -> tuple[str, Any]:
-        """The only entry, with its key."""
-        if len(self.found) != 1 or next(iter(self.found)) not in keys:
+    def one_of(self, *keys: str, besides: str = "") -> tuple[str, Any]:
+        """The only entry but for `besides`, with its key."""
+        found = [(key, value) for key, value in self.found.items() if key != besides]
+        if len(found) != 1 or found[0][0] not in keys:
             raise ImportSourceError(
                 f"{self.name} holds {[*self.found]}: must hold one of {', '.join(keys)}; correct it"
             )
-        ((key, value),) = self.found.items()
-        return key, value
+        return found[0]
 
 
-def _value(entry: _Entry) -> ValueMap:
-    kind, value = entry.one_of("attribute", "path", "value")
+def _value(entry: _Entry, besides: str = "") -> ValueMap:
+    kind, value = entry.one_of("attribute", "path", "value", besides=besides)
     if kind != "value":
         entry.text(kind)
     return ValueMap(kind=kind, value=value)
+
+
+def _label(entry: _Entry, attribute: str) -> ValueMap:
+    of = _value(entry, besides="names")
+    if "names" not in entry.found:
+        return of
+    names = entry.part("names")
+    levels = {str(level): level for level in range(UNKNOWN, LEVELS[attribute])}
+    if attribute == "material":
+        levels |= {material: i for i, material in enumerate(MATERIALS)}
+    wrong = next((name for name, level in names.found.items() if str(level) not in levels), None)
+    if wrong is not None:
+        raise ImportSourceError(
+            f"{names.name}: {wrong!r} is {names.found[wrong]!r:.60}: must be one of {', '.join(levels)}; correct it"
+        )
+    return dataclasses.replace(of, names={name: levels[str(level)] for name, level in names.found.items()})
 
 
 def _stream(entry: _Entry) -> StreamMap:

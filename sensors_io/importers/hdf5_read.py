@@ -49,6 +49,14 @@ class Place:
         return f"{self.file.name}{'' if self.group == '/' else self.group}" + (f", row {self.row}" if self.row else "")
 
 
+def spelled(value: Any) -> str:
+    """A value of a label as text; 1.0 is "1"."""
+    if isinstance(value, bytes):
+        return value.decode(errors="replace")
+    whole = isinstance(value, (float, np.floating)) and float(value).is_integer()
+    return str(int(value) if whole else value)
+
+
 def h5py() -> ModuleType:
     """The library that reads HDF5.
 

@@ -15,7 +15,7 @@ from sensors_io.importers.hdf5_inspect import UNKNOWN_UNIT, propose
 from sensors_io.importers.hdf5_map import read_map
 from sensors_io.importers.keep import ImportSourceError
 from sensors_io.records import RecordStore
-from sensors_io.schema import Flag
+from sensors_io.schema import MATERIALS, Flag
 
 RNG = np.random.default_rng(0)
 RGB = RNG.integers(0, 256, (6, 8, 10, 3), np.uint8)
@@ -92,6 +92,39 @@ def test_groups_by_trial_with_force_of_another_rate(tmp_path):
         assert (np.diff(sequence.host_time_ns) - 1e9 / 30 < 300).all()  # float64 seconds have steps of some ns here
         assert not sequence.flags.any()
     assert {contact[0].key.object_id for contact in contacts} == {"mug", "cup"}
+
+
+def test_labels_in_words_are_named_by_the_mapping(tmp_path):
+    said = (("soft", "steel", 1.0), ("rigid", "wood", 2.0), ("?", "steel", 3.0))
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for n, (hardness, material, roughness) in enumerate(said):
+            trial(group := file.create_group(f"trials/{n}"))
+            group.attrs["hardness class"], group.attrs["material"], group["info/roughness"] = (
+                hardness,
+                material,
+                roughness,
+            )
+    labels = propose(tmp_path / "a.h5")["labels"]
+    assert labels == {
+        "hardness": {"attribute": "hardness class", "names": {"?": "?", "rigid": "?", "soft": "?"}},
+        "roughness": {"path": "info/roughness", "names": {"1": "?", "2": "?", "3": "?"}},
+        "material": {"attribute": "material", "names": {"steel": "?", "wood": "?"}},
+    }
+    with pytest.raises(ImportSourceError, match=r"hardness: names: '\?' is '\?': must be one of -1, 0, 1, 2; correct"):
+        read_map(write_map(tmp_path, mapped(labels=labels)))
+    labels["hardness"]["names"] = {"?": -1, "rigid": 2, "soft": 0}
+    labels["roughness"]["names"] = {"1": 0, "2": 1, "3": 2}
+    labels["material"]["names"] = {"steel": "metal", "wood": "wood"}
+    catalogue = list_hdf5(tmp_path, HDF5Config(map=write_map(tmp_path, mapped(labels=labels)), **WHOLE))
+    metal, wood = MATERIALS.index("metal"), MATERIALS.index("wood")
+    assert [[*card.labels.values()] for card in catalogue.cards.values()] == [
+        [0, 0, metal],
+        [2, 1, wood],
+        [-1, 2, metal],
+    ]
+    del labels["material"]["names"]["wood"]
+    (skip,) = list_hdf5(tmp_path, HDF5Config(map=write_map(tmp_path, mapped(labels=labels)))).skipped
+    assert "material is 'wood': the names of the mapping lack it" in skip.reason
 
 
 def test_ragged_rows_of_compressed_arrays(tmp_path):
@@ -246,10 +279,13 @@ def test_a_proposal_needs_units_and_then_imports(tmp_path, capsys):
     assert main(["import", "hdf5", str(tmp_path), "--inspect"]) == 0
     shown = capsys.readouterr().out
     assert "rgb  uint8[6, 8, 10, 3]" in shown
-    assert "… and 2 groups of the same contents" in shown
+    assert "… with the arrays of 0: 1, 2\n" in shown
     layout = propose(tmp_path / "a.h5")
     assert layout["contact"] == "/trials/*"
     assert layout["sensors"]["mini"]["depth_mm"] == {"path": "mini/depth", "unit": "m"}  # stated by the file
+    assert [
+        s.reason for s in list_hdf5(tmp_path, HDF5Config(map=write_map(tmp_path, mapped(contact="/x/*")))).skipped
+    ] == ["no group fits contact '/x/*'; see `--inspect`"]
     with pytest.raises(ImportSourceError, match=r"unit is '\?'"):
         read_map(write_map(tmp_path, layout))
     path = write_map(tmp_path, json.loads(json.dumps(layout).replace(f'"unit": "{UNKNOWN_UNIT}"', '"unit": "s"')))
