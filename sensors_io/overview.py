@@ -2,7 +2,7 @@
 
 import collections
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from rich.table import Column, Table
@@ -11,6 +11,15 @@ from sensors_io.importers.catalogue import ImportReport
 from sensors_io.importers.keep import Skip
 from sensors_io.records import RecordStore
 from sensors_io.schema import ATTRIBUTES, MATERIALS, SPLITS, UNKNOWN, Flag, Sequence
+
+MEASURED: Mapping[str, str] = {
+    "depth_mm": "",
+    "deformation_mm": "xy",
+    "shear_mm": "xy",
+    "force_n": "xyz",
+    "moment_nmm": "xyz",
+}
+"""Array of measured values → its components, none for a scalar."""
 
 SKIPS_BY_NAME = 5
 """Up to so many things left out for one reason are named each."""
@@ -44,6 +53,33 @@ class FlagCounts:
         if judged == self.frames[sensor]:
             return str(count)
         return f"{count} of {judged}" if judged else "·"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ValueRanges:
+    """Least and greatest finite value of each measured array and component, by sensor."""
+
+    found: dict[tuple[str, str], tuple[float, float]] = dataclasses.field(default_factory=dict)
+
+    def add(self, sequence: Sequence) -> None:
+        """Take the values of a sequence into account."""
+        for name, axes in MEASURED.items():
+            values = getattr(sequence, name)
+            if values is None:
+                continue
+            columns = values.reshape(-1, max(len(axes), 1)).T
+            for array, column in zip([f"{name} {axis}" for axis in axes] or [name], columns, strict=True):
+                low, high = self.found.get((sequence.sensor, array), (np.inf, -np.inf))
+                finite = column[np.isfinite(column)]
+                self.found[sequence.sensor, array] = finite.min(initial=low), finite.max(initial=high)
+
+
+def range_table(ranges: ValueRanges) -> Table:
+    """Least and greatest value of every array: they show a wrong unit or sign."""
+    table = Table("sensor", "array", "least", "greatest", title="values")
+    for (sensor, name), (low, high) in sorted(ranges.found.items()):
+        table.add_row(sensor, name, f"{low:.3g}", f"{high:.3g}")
+    return table
 
 
 def summary_table(store: RecordStore) -> Table:

@@ -93,7 +93,7 @@ def write_report(directory: Path, results: Results, *, about: str, description: 
         description=description,
         timing=results.timing,
         settings=settings,
-        verdict=() if smoke else results.verdict,
+        verdict=() if smoke else tuple(line.replace(" %", "\u00a0%") for line in results.verdict),
         requirements=() if smoke else results.requirements,
         data={name: value for name, value in results.data.items() if not isinstance(value, Mapping)},
         data_title="Data and time",

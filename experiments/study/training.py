@@ -7,6 +7,7 @@ from typing import Literal, TypeVar
 
 from experiments.core.concurrency import SEED_BYTES
 from experiments.core.context import Context
+from experiments.core.errors import DataError
 from experiments.core.memory import require_memory
 from experiments.study.dataset import Dataset, open_dataset
 from experiments.study.sources import SourceConfig, odd_contacts, prepare_records
@@ -21,6 +22,7 @@ from touchr1_jax.models.lora import LoraConfig
 from touchr1_jax.models.pretrained import load_encoder
 from touchr1_jax.models.touch_policy import TouchConfig
 from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
+from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.training.linear_probe import ProbeConfig
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.training.optimizer import OptimizerConfig
@@ -163,6 +165,9 @@ def open_data(config: TrainingConfig, view_px: int, context: Context, at_once: i
     `at_once` is the number of seeds that are trained at the same time, for the estimate of the memory.
 
     Frames past the strain limit stay in: leaving them out would let the length of the force ramp give hardness away.
+
+    Raises:
+      DataError: records of a sensor that answers cannot name.
     """
     clip = ClipConfig(
         frames=config.model.frames,
@@ -178,7 +183,14 @@ def open_data(config: TrainingConfig, view_px: int, context: Context, at_once: i
     odd = odd_contacts(config, path, context)
     left_out = odd if config.drop_odd else ()
     grpo_share = GRPO_SHARE if config.recipe == "paper" else None
-    return open_dataset(path, clip, grpo_share, config.clip_memory_gib, config.read_threads, left_out)
+    data = open_dataset(path, clip, grpo_share, config.clip_memory_gib, config.read_threads, left_out)
+    known = [sensor.name for sensor in TOUCH_LANGUAGE.sensors]
+    if unknown := [name for name in data.clip.sensors if name not in known]:
+        raise DataError(
+            f"{path} holds records of {', '.join(unknown)}: answers name {', '.join(known)}; import the records under "
+            "one of these names, or add the sensor to `touchr1_jax.text.language`"
+        )
+    return data
 
 
 M = TypeVar("M", bound=TouchConfig)

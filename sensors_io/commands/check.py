@@ -20,9 +20,10 @@ class Check:
     """Read every entry, verify its checksum; exit status 1 if anything is damaged or missing.
 
     Tables count what an import left out, and frames by quality flag: as recorded, and as the quality filters judge them
-    today.  Another, by `--pictures`, looks at the pictures themselves: contact, its border and number, saturation, lost
-    markers.  A dot stands where the records hold nothing to tell a flag by.  Nothing is changed or deleted: a flag is a
-    bit beside its frame, and whoever reads the records chooses which flags to leave out.
+    today.  A table shows the least and greatest value of each array.  Another, by `--pictures`, looks at the pictures
+    themselves: contact, its border and number, saturation, lost markers.  A dot stands where the records hold nothing
+    to tell a flag by.  Nothing is changed or deleted: a flag is a bit beside its frame, and whoever reads the records
+    chooses which flags to leave out.
     """
 
     records: tyro.conf.Positional[pathlib.Path]
@@ -41,6 +42,7 @@ class Check:
     def run(self) -> int:
         store = RecordStore(self.records, allow_incomplete=True)
         recorded, judged, looked = overview.FlagCounts(), overview.FlagCounts(), overview.FlagCounts()
+        ranges = overview.ValueRanges()
         unseen: collections.Counter[str] = collections.Counter()
         problems: list[RecordsError] = []
         gels = self._gels(store)
@@ -53,6 +55,7 @@ class Check:
                     continue
                 for sequence in contact:
                     recorded.add(sequence)
+                    ranges.add(sequence)
                     found = quality.judge(sequence)
                     judged.add(quality.judged(sequence, found), found)
                 for sequence in contact if self.pictures else ():
@@ -68,6 +71,8 @@ class Check:
         left_out = _left_out(store)
         if left_out:
             OUT.print(_counted(left_out))
+        if ranges.found:
+            OUT.print(overview.range_table(ranges))
         OUT.print(overview.flag_table(recorded, "flags as recorded"))
         OUT.print(overview.flag_table(judged, "flags by the filters"))
         if self.pictures:

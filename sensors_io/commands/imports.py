@@ -16,7 +16,8 @@ from sensors_io.importers.estimate_modulus import list_estimate_modulus
 from sensors_io.importers.feelanyforce import FeelAnyForceConfig, list_feelanyforce
 from sensors_io.importers.gel import NO_GEL, SourceGel
 from sensors_io.importers.hdf5 import HDF5Config, hdf5_files, list_hdf5
-from sensors_io.importers.hdf5_inspect import UNKNOWN_UNIT, describe, propose
+from sensors_io.importers.hdf5_inspect import inspect
+from sensors_io.importers.hdf5_map import PLACEHOLDER
 from sensors_io.importers.hdf5_read import HDF5Error
 from sensors_io.importers.keep import ImportConfig, ImportSourceError, Keep, Shares
 from sensors_io.importers.octopi import list_octopi
@@ -169,7 +170,7 @@ class Hdf5:
     out: pathlib.Path = pathlib.Path("records")
     """Directory of the records."""
     inspect: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Print what the first file contains, and a mapping to begin with, and import nothing."""
+    """Print what the files contain, and a mapping to begin with, and import nothing."""
     config: HDF5Config = dataclasses.field(default_factory=HDF5Config)
 
     def catalogue(self) -> Catalogue:
@@ -177,12 +178,11 @@ class Hdf5:
 
     def show(self) -> int:
         """Print contents and proposal."""
-        first = hdf5_files(self.source)[0]
         try:
-            lines, proposal = describe(first), propose(first)
+            lines, proposal = inspect(hdf5_files(self.source))
         except HDF5Error as error:
-            raise ImportSourceError(f"{first} {error}; fetch it again, or leave it out") from error
-        for line in (*lines, "", f"A mapping; replace each {UNKNOWN_UNIT!r}, and save it for --map:", ""):
+            raise ImportSourceError(str(error)) from error
+        for line in (*lines, "", f"A mapping; replace each {PLACEHOLDER!r}, and save it for --map:", ""):
             OUT.print(line, markup=False, highlight=False, soft_wrap=True)
         OUT.print(json.dumps(proposal, indent=2), markup=False, highlight=False, soft_wrap=True)
         return 0

@@ -134,7 +134,8 @@ def import_catalogue(
                 progress(n + 1, len(catalogue.contacts))
         report = run.report()
         if not report.contacts:
-            first = report.skipped[0] if report.skipped else "nothing is listed"
+            skip = next(iter((*run.unread, *report.skipped)), None)
+            first = "nothing is listed" if skip is None else f"{skip.name}: {skip.reason}"
             raise ImportSourceError(f"{catalogue.source}: no contact can be read; the first: {first}")
         writer.note(report=dataclasses.asdict(report))
     return report

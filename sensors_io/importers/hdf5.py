@@ -54,17 +54,23 @@ def list_hdf5(source: pathlib.Path, config: HDF5Config) -> Catalogue:
     contacts: dict[ContactKey, Listed] = {}
     cards: dict[str, ObjectCard] = {}
     trials: dict[ContactKey, int] = {}  # the next one of those that a layout does not number
+    unmapped: set[str] = set()
     for path in files:
         try:
             with opened(path) as file:
                 places = list(contact_places(path, file, layout))
-                facts = [(place, *_facts(file, place, layout, config.annotator)) for place in places]
+                facts = [(place, _facts(file, place, layout, config.annotator)) for place in places]
+                unmapped.update(*(_unmapped(file, place, layout) for place in places[:1]))
         except HDF5Error as error:
             skipped.append(Skip(name=path.name, reason=str(error)))
             continue
         if not facts:
             skipped.append(Skip(name=path.name, reason=f"no group fits contact {layout.contact!r}; see `--inspect`"))
-        for place, key, card in facts:
+        for place, found in facts:
+            if isinstance(found, HDF5Error):
+                skipped.append(Skip(name=place.name, reason=str(found)))
+                continue
+            key, card = found
             if cards.setdefault(key.object_id, card) != card:
                 skipped.append(Skip(name=place.name, reason=f"labels object {key.object_id!r} unlike an earlier one"))
                 continue
@@ -74,6 +80,7 @@ def list_hdf5(source: pathlib.Path, config: HDF5Config) -> Catalogue:
             trials[stated] = key.trial + 1
             read = functools.partial(read_contact, place, key, layout, config)
             contacts[key] = Listed(key=key, name=place.name, read=read)
+    skipped += [Skip(name=name, reason="not in the mapping") for name in sorted(unmapped)]
     splits = split_by_name(cards, val_share=config.val_share, test_share=config.test_share)
     labelled = tuple(a for a in ATTRIBUTES if a in layout.labels)
     return Catalogue(
@@ -125,8 +132,20 @@ def _arrays(layout: LayoutMap) -> Iterator[ArrayMap]:
                 yield array.time
 
 
-def _facts(file: Any, place: Place, layout: LayoutMap, annotator: str) -> tuple[ContactKey, ObjectCard]:
-    """Key and card of a contact; the split is set later."""
+def _unmapped(file: Any, place: Place, layout: LayoutMap) -> list[str]:
+    """Data sets of a contact's group that the mapping names for nothing."""
+    named_paths = [path for a in _arrays(layout) for path in (a.path, *([] if a.rows is None else [a.rows.path]))]
+    values = (*layout.values.values(), *layout.labels.values())
+    named_paths += [str(of.value) for of in values if of.kind == "path"]
+    group = place.group.rstrip("/")
+    used = {path if path.startswith("/") else f"{group}/{path}" for path in named_paths}
+    found: list[str] = []
+    file[place.group].visititems(lambda name, item: found.append(name) if isinstance(item, h5py().Dataset) else None)
+    return [name for name in found if f"{group}/{name}" not in used]
+
+
+def _facts(file: Any, place: Place, layout: LayoutMap, annotator: str) -> tuple[ContactKey, ObjectCard] | HDF5Error:
+    """Key and card of a contact, or what is wrong with them; the split is set later."""
     value = lambda name, otherwise: (
         _stated(file, place, layout.values[name], name) if name in layout.values else otherwise
     )
@@ -137,8 +156,8 @@ def _facts(file: Any, place: Place, layout: LayoutMap, annotator: str) -> tuple[
         labels = {a: _level(a, _stated(file, place, of, a), of.names) for a, of in layout.labels.items()}
         name = object_id.replace("_", " ")
         return key, ObjectCard(object_id=object_id, split="train", labels=labels, annotator=annotator, name=name)
-    except SchemaError as error:
-        raise HDF5Error(f"{place.name}: {error}") from error
+    except (HDF5Error, SchemaError) as error:
+        return HDF5Error(str(error))
 
 
 def _stated(file: Any, place: Place, of: ValueMap, name: str) -> Any:

@@ -1,22 +1,22 @@
 """Contents of an HDF5 file as lines of text, and a mapping of them to begin with.
 
 The proposal goes by names, shapes and stated units.  What it cannot know it writes as "?", which `read_map` refuses by
-name, so that nobody imports a guess about a unit or about the order of levels.
+name, so that nobody imports a guess about a unit, a sign, the sensor or the order of levels.
 """
 
+import dataclasses
 import pathlib
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from sensors_io.importers.hdf5_map import QUANTITIES, UNITS
-from sensors_io.importers.hdf5_read import SPELLED, STATED, h5py, named, opened, spelled
+from sensors_io.importers.hdf5_map import PLACEHOLDER, QUANTITIES, UNITS
+from sensors_io.importers.hdf5_read import SPELLED, STATED, HDF5Error, h5py, named, opened, spelled
 from sensors_io.schema import ATTRIBUTES, LEVELS, MATERIALS, SENSORS
 
-UNKNOWN_UNIT = "?"
 DEEPEST = 3
 """Groups above a contact that a proposal looks through."""
 
@@ -37,51 +37,92 @@ NAMES: Mapping[str, str] = {
 """Array of the schema → pattern of the last part of a path."""
 
 
-def describe(path: pathlib.Path) -> tuple[str, ...]:
-    """A line for each group and data set; of groups with equal contents one is listed, and others are named.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Draft:
+    """A mapping for one file; `labels` are (where, what the file says there)."""
+
+    contact: str
+    values: Mapping[str, Any]
+    labels: Mapping[str, tuple[Mapping[str, str], frozenset[str]]]
+    sensors: Mapping[str, Any]
+
+
+def inspect(paths: Sequence[pathlib.Path]) -> tuple[list[str], dict[str, Any]]:
+    """Contents of files as lines, and a mapping of their layout as JSON, with "?" where a person must decide.
+
+    A line stands for each group and data set; of groups, or files, with equal contents one is listed, and others are
+    named.  The mapping is of the first file's layout.
 
     Raises:
-      HDF5Error: it is damaged.
+      HDF5Error: no file can be read.
     """
-    with opened(path) as file:
-        return (f"{path.name}", *_lines(file, "  "))
+    lines: list[str] = []
+    drafts: dict[pathlib.Path, _Draft] = {}
+    damaged: HDF5Error | None = None
+    for path in paths:
+        try:
+            with opened(path) as file:
+                draft = _draft(file)
+                alike = [other for other, of in drafts.items() if of.sensors == draft.sensors]
+                listed = () if alike else _lines(file, "  ")
+                lines += [f"{path.name}: the arrays of {alike[0].name}"] if alike else [path.name, *listed]
+            drafts[path] = draft
+        except HDF5Error as error:
+            damaged = HDF5Error(f"{path} {error}; fetch it again, or leave it out")
+            lines.append(str(damaged))
+    if not drafts:
+        raise damaged if damaged is not None else HDF5Error("there is no file")
+    first, *others = drafts.values()
+    same = [first, *(draft for draft in others if draft.sensors == first.sensors)]
+    labels = {
+        attribute: _named(
+            attribute, where, {value for draft in same for value in draft.labels.get(attribute, ((), ()))[1]}
+        )
+        for attribute, (where, _) in first.labels.items()
+    }
+    head = {"source": paths[0].parent.name, "licence": PLACEHOLDER, "contact": _common([d.contact for d in same])}
+    return lines, {**head, **first.values, **({"labels": labels} if labels else {}), "sensors": first.sensors}
 
 
-def propose(path: pathlib.Path) -> dict[str, Any]:
-    """A mapping of the file's layout, as JSON; "?" where a person must decide.
-
-    Raises:
-      HDF5Error: the file is damaged.
-    """
-    with opened(path) as file:
-        pattern, group = _contacts(file)
-        found = {name: data for name, data in _datasets(group) if data.dtype.kind in "fiuO"}
-        rows = next(({kind: f"/{n}"} for n in found for kind in ("lengths", "offsets") if kind[:6] in n.lower()), None)
-        sensors: dict[str, dict[str, Any]] = {}
-        arrays = {name: kind for name, data in found.items() if (kind := _kind(name, data)) is not None}
-        for name, kind in arrays.items():
-            if kind in ("frames", "depth_mm", "deformation_mm"):
-                sensors.setdefault(_sensor(name), {})
-        for name, kind in arrays.items():
-            entry = _entry(name, kind, found[name], rows)
-            of = [s for s in sensors if s == _sensor(name)] or list(sensors)  # a force sensor serves all of them
-            for sensor in of:
-                if kind == "host_time_ns" and sensor != _sensor(name):
-                    continue
-                times = [t for t, k in arrays.items() if k == "host_time_ns" and _folder(t) == _folder(name)]
-                own = {"time": _entry(times[0], "host_time_ns", found[times[0]], rows)} if times else {}
-                sensors[sensor].setdefault(kind, entry | (own if sensor != _sensor(name) else {}))
-        for stream in sensors.values():
-            if "host_time_ns" not in stream:
-                stream["rate_hz"] = UNKNOWN_UNIT
-        named = next((a for a in group.attrs if re.search("object|sample|specimen|item", a.lower())), None)
-        object_id = {"object_id": {"attribute": named}} if named else {}
-        labels = {a: label for a in ATTRIBUTES if (label := _label(a, file, group)) is not None}
-        head = {"source": path.parent.name, "licence": "?", "contact": pattern, **object_id}
-        return {**head, **({"labels": labels} if labels else {}), "sensors": sensors}
+def _draft(file: Any) -> _Draft:
+    pattern, group = _contacts(file)
+    found = {name: data for name, data in _datasets(group) if data.dtype.kind in "fiuO"}
+    rows = next(({kind: f"/{n}"} for n in found for kind in ("lengths", "offsets") if kind[:6] in n.lower()), None)
+    sensors: dict[str, dict[str, Any]] = {}
+    arrays = {name: kind for name, data in found.items() if (kind := _kind(name, data)) is not None}
+    for name, kind in arrays.items():
+        if kind in ("frames", "depth_mm", "deformation_mm"):
+            sensors.setdefault(_sensor(name), {})
+    for name, kind in arrays.items():
+        entry = _entry(name, kind, found[name], rows)
+        of = [s for s in sensors if s == _sensor(name)] or list(sensors)  # a force sensor serves all of them
+        for sensor in of:
+            if kind == "host_time_ns" and sensor != _sensor(name):
+                continue
+            times = [t for t, k in arrays.items() if k == "host_time_ns" and _folder(t) == _folder(name)]
+            own = {"time": _entry(times[0], "host_time_ns", found[times[0]], rows)} if times else {}
+            sensors[sensor].setdefault(kind, entry | (own if sensor != _sensor(name) else {}))
+    for stream in sensors.values():
+        if "host_time_ns" not in stream:
+            stream["rate_hz"] = PLACEHOLDER
+    named = next((a for a in group.attrs if re.search("object|sample|specimen|item", a.lower())), None)
+    moved = next((a for a in group.attrs if "motion" in a.lower()), None)
+    object_id = {"object_id": {"attribute": named}} if named else {}
+    return _Draft(
+        contact=pattern,
+        values={**object_id, "motion": {"attribute": moved} if moved else {"value": PLACEHOLDER}},
+        labels={a: label for a in ATTRIBUTES if (label := _label(a, file, group)) is not None},
+        sensors=sensors,
+    )
 
 
-def _label(attribute: str, file: Any, group: Any) -> dict[str, Any] | None:
+def _common(patterns: Sequence[str]) -> str:
+    """One pattern for all of those that are as deep as the first."""
+    parts = [pattern.split("/") for pattern in patterns if pattern.count("/") == patterns[0].count("/")]
+    return "/".join(one[0] if len(set(one)) == 1 else "*" for one in zip(*parts, strict=True))
+
+
+def _label(attribute: str, file: Any, group: Any) -> tuple[Mapping[str, str], frozenset[str]] | None:
     """The attribute or data set of a contact that seems to be this label, and all that the file says there."""
     above = group
     while above.name != "/" and not any(attribute in a.lower() for a in above.attrs):
@@ -100,11 +141,14 @@ def _label(attribute: str, file: Any, group: Any) -> dict[str, Any] | None:
 
     gather("", file)
     file.visititems(gather)
-    of = {"attribute": in_attributes[0]} if in_attributes else {"path": in_arrays[0]}
+    where = {"attribute": in_attributes[0]} if in_attributes else {"path": in_arrays[0]}
+    return (where, frozenset(values)) if len(values) <= MOST_NAMES else None
+
+
+def _named(attribute: str, where: Mapping[str, str], values: set[str]) -> dict[str, Any]:
+    """The entry of a label; values that are no levels need names."""
     plain = {str(level) for level in range(LEVELS[attribute])} | set(MATERIALS if attribute == "material" else ())
-    if len(values) > MOST_NAMES:
-        return None
-    return of if values <= plain else {**of, "names": dict.fromkeys(sorted(values), UNKNOWN_UNIT)}
+    return dict(where) if values <= plain else {**where, "names": dict.fromkeys(sorted(values), PLACEHOLDER)}
 
 
 def _lines(group: Any, indent: str) -> Iterator[str]:
@@ -178,14 +222,15 @@ def _entry(name: str, kind: str, data: Any, rows: Mapping[str, str] | None) -> d
     said = next((str(data.attrs[a]) for a in STATED if a in data.attrs), "")
     unit = SPELLED.get(said.strip().lower(), said.strip())
     if kind != "frames":
-        entry["unit"] = unit if unit in UNITS[quantity.kind] else UNKNOWN_UNIT
+        entry["unit"] = unit if unit in UNITS[quantity.kind] else PLACEHOLDER
     whole: dict[str, Any] = dict(entry)
     if kind == "frames" and data.ndim < 4:
         whole["encoded"] = True
     elif kind == "frames" and data.shape[-1] != len(quantity.components):
         whole["axes"] = "NCHW"
-    elif quantity.components and data.shape[-1] > len(quantity.components):
-        whole["components"] = [*quantity.components, *[None] * (data.shape[-1] - len(quantity.components))]
+    elif kind != "frames" and quantity.components:
+        whole["components"] = [PLACEHOLDER] * len(quantity.components)
+        whole["components"] += [None] * (data.shape[-1] - len(quantity.components))
     return whole if rows is None else whole | {"rows": dict(rows)}
 
 
@@ -197,4 +242,5 @@ def _sensor(name: str) -> str:
     """The sensor of a data set: one that the path names, else the group that it lies in."""
     plain = re.sub(r"[^a-z0-9]", "", name.lower())
     known = next((s for s in SENSORS if s.replace("_", "") in plain or s.partition("_")[0] in plain), None)
-    return known or re.sub(r"[^A-Za-z0-9.\-]+", "_", _folder(name)).strip("_.-") or "sensor"
+    plain = re.sub(r"[^A-Za-z0-9.\-]+", "_", _folder(name)).strip("_.-") or "sensor"
+    return known or f"{PLACEHOLDER} {plain}"

@@ -6,7 +6,7 @@
       "object_id": {"attribute": "object"}, "motion": {"value": "press"},
       "labels": {
         "hardness": {"path": "labels/hardness"},
-        "material": {"attribute": "made of", "names": {"steel": "metal", "oak": "wood", "?": -1}}
+        "material": {"attribute": "made of", "names": {"steel": "metal", "oak": "wood", "unknown": -1}}
       },
       "sensors": {
         "gelsight_mini": {
@@ -19,8 +19,12 @@
       }
     }
 
-`contact` is a pattern of groups, each one contact; "/" takes a file for one.  A path is relative to that group, or to
-the file with a leading "/".  A label is a level, or a name of a material; `names` turns what a file says into these.
+`contact` is a pattern of groups, each one contact, in which "*" may stand at every level; "/" takes a file for one.  A
+path is relative to that group, or to the file with a leading "/".  Sensors that the studies know are gelsight_mini,
+xense, tac3d and dmtac_x.  Vectors are on the gel: x points right, y down, z out of the gel, so a press has Fz < 0.  A
+label is a level from 0 (soft, smooth, flat) to 2, or a name of a material; `names` turns what a file says into these.
+Without an entry, a contact is an object of its own, its motion is "free", and its site and trial are 0, or the next
+trial that is free.
 """
 
 import dataclasses
@@ -30,7 +34,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from sensors_io.importers.keep import LEAST_HZ, MOST_HZ, ImportSourceError
-from sensors_io.schema import ATTRIBUTES, LEVELS, MATERIALS, UNKNOWN
+from sensors_io.schema import ATTRIBUTES, LEVELS, MATERIALS, MOTIONS, SENSORS, UNKNOWN
+
+PLACEHOLDER = "?"
+"""What `--inspect` writes where a person must decide; refused by name."""
 
 UNITS: Mapping[str, Mapping[str, float]] = {
     "picture": {"": 1.0, "1": 255.0},
@@ -89,7 +96,8 @@ class ArrayMap:
       path: of the data set.
       factor: to the unit of the schema; `unit` as the map gives it.
       axes: of the data set in its order, such as "NCHW"; pictures without C are grey.
-      components: along its axis C in its order, with "-" before one of the opposite sign; "" for one to leave out.
+      components: along its axis C in its order, with "-" before one of the opposite sign; `null` in the mapping, ""
+        here, leaves one out.
       rows: of a contact, where the data set holds those of many.
       time: of its own rows, where it was sampled by another clock than the frames.
       encoded: its rows are JPEG or PNG files.
@@ -156,11 +164,23 @@ def read_map(path: pathlib.Path) -> LayoutMap:
         raise ImportSourceError(f"{sensors.name} is empty: must name at least one sensor; add its arrays")
     labels = root.part("labels", {})
     labels.know(*ATTRIBUTES)
+    open_names = [name for name in sensors.found if name.startswith(PLACEHOLDER)]
+    if open_names or root.found.get("licence") == PLACEHOLDER:
+        known = f"must be one of {', '.join(SENSORS)}, or another name, which studies do not know"
+        raise ImportSourceError(
+            f"{sensors.name}: {open_names[0]!r}: {known}; rename it"
+            if open_names
+            else f"{root.name}: licence is {PLACEHOLDER!r}: must be the licence of the recordings; give it"
+        )
+    values = {name: _value(root.part(name)) for name in _VALUES if name in root.found}
+    motion = values.get("motion")
+    if motion is not None and motion.kind == "value" and motion.value not in MOTIONS:
+        raise ImportSourceError(f"{root.name}: motion is {motion.value!r:.60}: must be one of {', '.join(MOTIONS)}")
     return LayoutMap(
         source=root.text("source", "HDF5 recordings"),
         licence=root.text("licence", "all rights reserved"),
         contact=root.text("contact", "/"),
-        values={name: _value(root.part(name)) for name in _VALUES if name in root.found},
+        values=values,
         labels={name: _label(labels.part(name), name) for name in labels.found},
         sensors={name: _stream(sensors.part(name)) for name in sensors.found},
     )

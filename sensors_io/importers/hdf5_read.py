@@ -27,6 +27,9 @@ SPELLED = {
 }  # fmt: skip
 """Other spellings of units, in lower case."""
 
+LEAST_PULL_N = 0.5
+"""Force away from the gel that neither drift nor adhesion explains."""
+
 LATE = 1.5
 """Median periods between two frames from which on one is taken to be missing."""
 
@@ -289,7 +292,7 @@ class _Rows:
         """Numbers in the unit, the signs and the order of components of the schema, float32.
 
         Raises:
-          HDF5Error: no tactile sensor gives such values.
+          HDF5Error: no tactile sensor gives such values, or the force pulls at the gel.
         """
         quantity, found = QUANTITIES[name], self._raw(positions).astype(np.float64) * self.array.factor
         if quantity.components:
@@ -303,6 +306,13 @@ class _Rows:
                 f"{self.array.path} reaches {greatest:.3g} as {name}: a sensor gives {bound}; is the unit "
                 f"{self.array.unit!r}?"
             )
+        if name == "force_n" and (pull := float(np.nanmax(found[:, 2], initial=0.0))) > max(
+            LEAST_PULL_N, float(-np.nanmin(found[:, 2], initial=0.0))
+        ):
+            raise HDF5Error(
+                f"{self.array.path} reaches Fz = +{pull:.3g} N, which pulls at the gel: a press has Fz < 0; turn the "
+                "sign of z in `components`"
+            )
         return found.astype(np.float32)
 
     def times_ns(self, positions: np.ndarray) -> np.ndarray:
@@ -315,15 +325,21 @@ class _Rows:
         if np.issubdtype(found.dtype, np.integer):
             greatest = max(int(found.max(initial=0)), -int(found.min(initial=0)))
             if greatest * int(factor) >= 2**63:
-                raise HDF5Error(f"{self.array.path} for {self.what} holds times beyond 64 bits of nanoseconds")
+                raise HDF5Error(self._beyond())
             found = found.astype(np.int64) * int(factor)
         else:
-            if not np.isfinite(found).all() or np.abs(found.astype(np.float64)).max(initial=0) >= 2**63 / factor:
+            if not np.isfinite(found).all():
                 raise HDF5Error(f"{self.array.path} for {self.what} holds times that are not finite")
+            if np.abs(found.astype(np.float64)).max(initial=0) >= 2**63 / factor:
+                raise HDF5Error(self._beyond())
             found = np.rint(found.astype(np.float64) * factor).astype(np.int64)
         if (np.diff(found) < 0).any():
             raise HDF5Error(f"{self.array.path} for {self.what} runs backwards")
         return found
+
+    def _beyond(self) -> str:
+        unit = self.array.unit
+        return f"{self.array.path} for {self.what} holds times beyond 64 bits of nanoseconds; is the unit {unit!r}?"
 
     def pictures(self, positions: np.ndarray, keep: Keep) -> np.ndarray:
         """Pictures, uint8 [N, H, W, 3], RGB, at `keep.height` rows."""

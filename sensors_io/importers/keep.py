@@ -13,9 +13,6 @@ HIGHEST = 16_384
 LEAST_HZ, MOST_HZ = 1e-3, 1e6
 """Frame rates; at others, times are beyond 64 bits or all the same."""
 
-WIDEST = 100
-"""Columns for each row of a picture that is brought to a number of rows."""
-
 
 class ImportSourceError(UserError, ValueError):
     """A source that cannot be imported; the message names the path, the problem and the fix."""
@@ -37,11 +34,11 @@ class Skip:
 class Keep:
     """Selection within each recording.
 
-    The defaults store 120 rows, just above the 112 of a clip, and 32 frames, four times those of a clip: every clip
-    decodes all frames of its entry.  Keep everything with height = max_frames = 0.
+    The defaults store 120 rows at most, just above the 112 of a clip, and 32 frames, four times those of a clip: every
+    clip decodes all frames of its entry.  Keep everything with height = max_frames = 0.
 
     Args:
-      height: rows stored, with the aspect ratio kept (INTER_AREA); 0 stores frames as they are decoded.
+      height: rows to which larger pictures are reduced, with the aspect ratio kept (INTER_AREA); 0 reduces none.
       stride: keep every stride-th frame.
       max_frames: of those, at most this many, evenly spaced (or in each piece, where a source cuts long recordings into
         pieces); 0 keeps all.
@@ -72,15 +69,8 @@ class Keep:
         return [kept[start : start + size] for start in range(0, len(kept), size)]
 
     def shrink(self, image: np.ndarray) -> np.ndarray:
-        """The image at `height` rows, uint8 [H, W, 3].
-
-        Raises:
-          UnreadableError: one that is so wide that it would get larger than any picture.
-        """
-        rows, columns = image.shape[:2]
-        if columns > WIDEST * rows:
-            raise UnreadableError(f"has {rows} × {columns} pixels, more than {WIDEST} columns for each row")
-        return at_height(image, self.height)
+        """The image at `height` rows at most, uint8 [H, W, 3]."""
+        return at_height(image, min(self.height, image.shape[0]))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ from sensors_io.records import RecordsExistError, RecordStore
 from tests.sensors_io.checks import refused
 
 GELSLAM = pathlib.Path(__file__).resolve().parents[2] / "data" / "gelslam"
-CONFIG = VideosConfig(sensor="gelsight_mini", height=120)
+CONFIG = VideosConfig(sensor="gelsight_mini", height=40)
 
 
 @pytest.fixture
@@ -35,8 +35,8 @@ def test_an_import_keeps_the_pitch_of_what_it_stores_and_the_gel_at_rest(tmp_pat
     import_catalogue(list_videos(presses, CONFIG), tmp_path / "r", gel=gel)
     sequence = RecordStore(tmp_path / "r").contact(0)["gelsight_mini"]
     rows = read_picture(GELSLAM / "background.png").shape[0]
-    assert sequence.frames.shape[1] == 120
-    assert sequence.mm_per_px == pytest.approx(0.0634 * rows / 120)
+    assert sequence.frames.shape[1] == 40
+    assert sequence.mm_per_px == pytest.approx(0.0634 * rows / 40)
     rest = read_picture(tmp_path / "r" / sequence.camera["recording"]["background"])
     np.testing.assert_array_equal(rest, read_picture(GELSLAM / "background.png"))
     refused(RecordsExistError, "another|made by", import_catalogue, list_videos(presses, CONFIG), tmp_path / "r")

@@ -11,7 +11,7 @@ import pytest
 from sensors_io.__main__ import main
 from sensors_io.importers.catalogue import import_catalogue
 from sensors_io.importers.hdf5 import HDF5Config, list_hdf5
-from sensors_io.importers.hdf5_inspect import UNKNOWN_UNIT, propose
+from sensors_io.importers.hdf5_inspect import inspect
 from sensors_io.importers.hdf5_map import read_map
 from sensors_io.importers.keep import ImportSourceError
 from sensors_io.records import RecordStore
@@ -68,11 +68,12 @@ def test_rows_by_unsigned_lengths_share_one_value_and_pictures_in_0_to_1_need_no
     frames = {"path": "/rgb", "unit": "1", "rows": {"lengths": "/rows"}}
     layout = {"object_id": {"attribute": "object"}, "sensors": {"gelsight_mini": {"frames": frames, "rate_hz": 30}}}
     contacts, report = imported(tmp_path, layout)
-    assert report.skipped == ()
+    assert [(skip.name, skip.reason) for skip in report.skipped] == [("hardness", "not in the mapping")]
     np.testing.assert_array_equal(np.concatenate([sequence.frames for (sequence,) in contacts]), RGB)
     labelled = layout | {"labels": {"hardness": {"path": "/hardness"}}}
-    (skip,) = list_hdf5(tmp_path, HDF5Config(map=write_map(tmp_path, labelled))).skipped
-    assert "hardness is " in skip.reason  # 1.5 is no level
+    skips = list_hdf5(tmp_path, HDF5Config(map=write_map(tmp_path, labelled))).skipped
+    assert [skip.name for skip in skips] == ["a.h5", "a.h5, row 1"]
+    assert all("hardness is " in skip.reason for skip in skips)  # 1.5 is no level
 
 
 def test_groups_by_trial_with_force_of_another_rate(tmp_path):
@@ -104,7 +105,7 @@ def test_labels_in_words_are_named_by_the_mapping(tmp_path):
                 material,
                 roughness,
             )
-    labels = propose(tmp_path / "a.h5")["labels"]
+    labels = inspect([tmp_path / "a.h5"])[1]["labels"]
     assert labels == {
         "hardness": {"attribute": "hardness class", "names": {"?": "?", "rigid": "?", "soft": "?"}},
         "roughness": {"path": "info/roughness", "names": {"1": "?", "2": "?", "3": "?"}},
@@ -280,20 +281,50 @@ def test_a_proposal_needs_units_and_then_imports(tmp_path, capsys):
     shown = capsys.readouterr().out
     assert "rgb  uint8[6, 8, 10, 3]" in shown
     assert "… with the arrays of 0: 1, 2\n" in shown
-    layout = propose(tmp_path / "a.h5")
+    layout = inspect([tmp_path / "a.h5"])[1]
     assert layout["contact"] == "/trials/*"
-    assert layout["sensors"]["mini"]["depth_mm"] == {"path": "mini/depth", "unit": "m"}  # stated by the file
-    assert [
-        s.reason for s in list_hdf5(tmp_path, HDF5Config(map=write_map(tmp_path, mapped(contact="/x/*")))).skipped
-    ] == ["no group fits contact '/x/*'; see `--inspect`"]
-    with pytest.raises(ImportSourceError, match=r"unit is '\?'"):
+    wrong = HDF5Config(map=write_map(tmp_path, mapped(contact="/x/*")))
+    assert [s.reason for s in list_hdf5(tmp_path, wrong).skipped] == ["no group fits contact '/x/*'; see `--inspect`"]
+    assert layout["sensors"]["? mini"]["depth_mm"] == {"path": "mini/depth", "unit": "m"}  # stated by the file
+    with pytest.raises(ImportSourceError, match=r"'\? mini': must be one of gelsight_mini"):
         read_map(write_map(tmp_path, layout))
-    path = write_map(tmp_path, json.loads(json.dumps(layout).replace(f'"unit": "{UNKNOWN_UNIT}"', '"unit": "s"')))
-    whole = json.loads(path.read_text())
-    whole["sensors"]["mini"]["force_n"]["unit"] = "N"
-    write_map(tmp_path, whole)
+    layout["sensors"] = {"gelsight_mini": layout["sensors"]["? mini"]}
+    mini = layout["sensors"]["gelsight_mini"]
+    for said, entry, name, value in (
+        (r"licence is '\?'", layout, "licence", "CC BY 4.0"),
+        (r"motion is '\?'", layout["motion"], "value", "press"),
+        (r"force_n: unit is '\?'", mini["force_n"], "unit", "N"),
+        (r"time: unit is '\?'", mini["force_n"]["time"], "unit", "s"),
+        (r"components is \['\?', '\?', '\?'\]", mini["force_n"], "components", ["x", "y", "z"]),
+        (r"host_time_ns: unit is '\?'", mini["host_time_ns"], "unit", "s"),
+    ):
+        with pytest.raises(ImportSourceError, match=said):
+            read_map(write_map(tmp_path, layout))
+        entry[name] = value
+    path = write_map(tmp_path, layout)
     assert main(["import", "hdf5", str(tmp_path), "--map", str(path), "--out", str(tmp_path / "records")]) == 0
     assert len(RecordStore(tmp_path / "records")) == 3
+
+
+def test_a_draft_is_of_all_files_and_a_force_that_pulls_is_refused(tmp_path, capsys):
+    for name, hardness in (("a", "soft"), ("b", "hard")):
+        with h5py.File(tmp_path / f"{name}.h5", "w") as file:
+            for n in range(2):
+                trial(group := file.create_group(f"{name}/{n}"))
+                group.attrs["hardness"] = hardness
+                del group["ft/force"]
+                group["ft/force"] = np.abs(FORCE)
+    assert main(["import", "hdf5", str(tmp_path), "--inspect"]) == 0
+    assert "b.h5: the arrays of a.h5\n" in capsys.readouterr().out
+    draft = inspect(sorted(tmp_path.glob("*.h5")))[1]
+    assert (draft["contact"], draft["labels"]["hardness"]["names"]) == ("/*/*", {"hard": "?", "soft": "?"})
+    with pytest.raises(ImportSourceError, match=r"Fz = \+.* N, which pulls at the gel"):
+        imported(tmp_path, mapped(contact="/*/*"))
+    force = mapped()["sensors"]["gelsight_mini"]["force_n"] | {"components": ["x", "y", "-z"]}
+    contacts, _ = imported(tmp_path, mapped(contact="/*/*", mini={"force_n": force}))
+    assert len(contacts) == 4
+    assert main(["check", str(tmp_path / "records")]) == 0
+    assert f"{-np.abs(FORCE[::2, 2]).max():.3g}" in capsys.readouterr().out  # the least Fz of the table
 
 
 def test_contacts_of_one_object_without_numbers_are_numbered_in_linear_time(tmp_path):
@@ -325,7 +356,7 @@ def test_absurd_values_and_sizes_are_left_out_by_name(tmp_path):
         ({"labels": {"hardness": {"value": 1.7}}}, "hardness is 1.7: must be a whole number"),
         ({"site": {"value": 2**32}}, "site is 4294967296: must lie in 0"),
         ({"mini": {"host_time_ns": second}}, "beyond 64 bits of nanoseconds"),
-        ({"mini": {"host_time_ns": second | {"path": "/late"}}}, "times that are not finite"),
+        ({"mini": {"host_time_ns": second | {"path": "/late"}}}, "beyond 64 bits of nanoseconds; is the unit"),
         ({"mini": {"frames": {"path": "/wide"}, "depth_mm": None}}, "cannot be read: Unable to allocate"),
         ({"mini": {"frames": {"path": "/pictures", "encoded": True}}}, "pictures of different sizes"),
         ({"mini": {"frames": {"path": "mini/rgb", "rows": {"lengths": "/rows"}}}}, "/rows must hold the lengths"),
