@@ -4,10 +4,9 @@ This module imports little, since what it imports adds to the memory of the proc
 """
 
 import dataclasses
-import json
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
@@ -21,9 +20,9 @@ from experiments.engine.processes import in_own_process
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.load import peak_memory
 from touchr1_jax.models.qwen.config import RELEASED, QwenConfig, QwenVisionConfig
-from touchr1_jax.models.qwen.names import published, read, sources
-from touchr1_jax.models.qwen.safetensors import read_tensor, write_file
-from touchr1_jax.models.qwen.weights import INDEX, find_tensors, load_params
+from touchr1_jax.models.qwen.names import Source, read, sources
+from touchr1_jax.models.qwen.safetensors import read_tensor
+from touchr1_jax.models.qwen.weights import find_tensors, load_params, save_tensors
 
 TINY = QwenConfig(
     decoder=DecoderConfig(
@@ -92,42 +91,14 @@ SIGN_AND_FRACTION, SMALL = 0x807F, 0x3C00
 
 
 def random_checkpoint(directory: Path, config: QwenConfig, shard_bytes: int, progress: ProgressCallback) -> int:
-    """Write weights of a shape in bfloat16 and their index, never more than a shard in memory; return their bytes."""
+    """Write weights of a shape in bfloat16 and their index, never more than a tensor in memory; return their bytes."""
     rng = np.random.default_rng(0)
-    place: dict[str, str] = {}
-    cut = list(shards(config, shard_bytes))
-    size, every = 0, sum(2 * math.prod(shape) for shapes in cut for shape in shapes.values())
-    for i, shapes in enumerate(cut):
-        name, tensors, drawn = f"model-{i + 1:05}.safetensors", {}, 0
-        for key, shape in shapes.items():
-            bits = np.frombuffer(rng.bytes(2 * math.prod(shape)), np.uint16)
-            tensors[key] = ((bits & SIGN_AND_FRACTION) | SMALL).view(jnp.bfloat16).reshape(shape)
-            drawn += tensors[key].nbytes
-            progress(size + drawn // 2, every)
-        write_file(directory / name, tensors, _after(size + drawn // 2, every, progress))
-        place |= dict.fromkeys(tensors, name)
-        size += drawn
-    index = {"metadata": {"total_size": size}, "weight_map": place}
-    (directory / INDEX).write_text(json.dumps(index), encoding="utf-8")
-    return size
 
+    def draw(s: Source) -> np.ndarray:
+        bits = np.frombuffer(rng.bytes(2 * math.prod(s.shape)), np.uint16)
+        return ((bits & SIGN_AND_FRACTION) | SMALL).view(jnp.bfloat16).reshape(s.shape)
 
-def _after(begun: int, every: int, progress: ProgressCallback) -> ProgressCallback:
-    return lambda done, _: progress(begun + done // 2, every)
-
-
-def shards(config: QwenConfig, shard_bytes: int) -> Iterator[dict[str, tuple[int, ...]]]:
-    """Published keys and shapes, cut into shards in the order of the parameters."""
-    shard: dict[str, tuple[int, ...]] = {}
-    filled = 0
-    for s in sources(config).values():
-        size = 2 * math.prod(s.shape)
-        if shard and filled + size > shard_bytes:
-            yield shard
-            shard, filled = {}, 0
-        shard[published(s.key, config)] = s.shape
-        filled += size
-    yield shard
+    return save_tensors(directory, config, draw, jnp.dtype(jnp.bfloat16), progress, shard_bytes)
 
 
 def measure(reader: Reader, directory: Path, config: QwenConfig, progress: ProgressCallback) -> LoadMeasurement:

@@ -27,7 +27,7 @@ from touchr1_jax.models.load import TOKENIZER_FILE, load_checkpoint
 from touchr1_jax.models.qwen.config import CONFIG_FILE, AnyVision, Qwen3VisionConfig, QwenConfig, QwenVisionConfig
 from touchr1_jax.models.qwen.model import init_params
 from touchr1_jax.models.qwen.pictures import PREPROCESSOR_FILE
-from touchr1_jax.models.qwen.weights import SINGLE, save_params
+from touchr1_jax.models.qwen.weights import save_params
 from touchr1_jax.models.released_policy import ReleasedModel, ReleasedPolicy, build_released_policy, plain_answers
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import touch_shapes
@@ -130,7 +130,7 @@ def write_tiny(directory: Path, language: Language, system: str = SYSTEM, decode
     template = TEMPLATE if isinstance(vision, QwenVisionConfig) else TEMPLATE_QWEN3
     shutil.copy(template, directory / TEMPLATE.name)
     params = jax.jit(lambda key: init_params(config, key))(jax.random.key(0))
-    save_params(directory / SINGLE, jax.tree.map(lambda x: x.astype(jnp.bfloat16), params), config)
+    save_params(directory, jax.tree.map(lambda x: x.astype(jnp.bfloat16), params), config)
 
 
 def trained_tokenizer(language: Language, system: str) -> tokenizers.Tokenizer:
@@ -215,7 +215,7 @@ def teach(directory: Path, steps: int, context: Context, batch_size: int = TEACH
             state, metrics = step(state, drawn_batch(policy, shown, np.random.default_rng((0, t))))
             context.log(STAGE, t, **jax.device_get(metrics))
     taught = {"vision": state.params["vision"]["tower"], "decoder": state.params["decoder"]}
-    save_params(directory / SINGLE, jax.tree.map(lambda x: x.astype(jnp.bfloat16), taught), found.config)
+    save_params(directory, jax.tree.map(lambda x: x.astype(jnp.bfloat16), taught), found.config)
 
 
 def drawn_batch(policy: ReleasedPolicy, shown: TouchBatch, rng: np.random.Generator) -> SFTBatch:

@@ -22,11 +22,13 @@ import numpy as np
 from flax import traverse_util
 
 from touchr1_jax.models.load import Checkpoint, WeightsError, load_checkpoint
-from touchr1_jax.models.lora import LoraConfig, by_layer, exported, kept_share
+from touchr1_jax.models.lora import Adapter, LoraConfig, by_layer, merged_kernel
+from touchr1_jax.models.qwen import names
 from touchr1_jax.models.qwen.config import CONFIG_FILE
+from touchr1_jax.models.qwen.names import Source
 from touchr1_jax.models.qwen.peft import PEFT_CONFIG, PEFT_WEIGHTS, load_adapters, save_adapters
 from touchr1_jax.models.qwen.safetensors import ReportBytes, read_header, read_tensor, write_file
-from touchr1_jax.models.qwen.weights import INDEX, SINGLE, load_params, save_params
+from touchr1_jax.models.qwen.weights import INDEX, find_tensors, row_of, save_tensors
 from touchr1_jax.models.released_policy import ReleasedModel, ReleasedPolicy, build_released_policy, instruction
 from touchr1_jax.models.saved_policy import (
     CARD,
@@ -180,7 +182,8 @@ def _read_either(folder: Path, weights: Path | None) -> SavedPolicy:
 def export_merged(folder: Path, saved: SavedPolicy, dtype: jnp.dtype, progress: ReportBytes = SILENT) -> float:
     """Publish the released folder with the adapters merged into its weights, and the touch encoder beside them.
 
-    Of a base in four bits the released weights are read again, which is what adapters are usually merged into.
+    One tensor at a time is merged and written.  Of a base in four bits the released weights are read again, which is
+    what adapters are usually merged into.
 
     Args:
       folder: new, or empty.
@@ -198,20 +201,30 @@ def export_merged(folder: Path, saved: SavedPolicy, dtype: jnp.dtype, progress: 
     assert isinstance(policy, ReleasedPolicy)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise PolicyError(f"folder is {folder}: it exists and is not empty; choose a new one")
-    released = {name: saved.params[name] for name in ("decoder", "vision")}
-    if policy.model.four_bits:
-        read = load_params(policy.checkpoint.directory, policy.checkpoint.config, dtype)
-        released = {"decoder": read["decoder"], "vision": {"tower": read["vision"]}}
-    base = jax.tree.map(lambda x: x.astype(dtype), released)
-    whole = exported({**base, ADAPTERS: saved.params[ADAPTERS]}, policy.fns.lora)
-    merged = {"vision": whole["vision"]["tower"], "decoder": whole["decoder"]}
+    released = {"decoder": saved.params["decoder"], "vision": saved.params["vision"]["tower"]}
+    flat, adapters = traverse_util.flatten_dict(released), by_layer(of_checkpoint(saved.params[ADAPTERS]))
+    stored = find_tensors(policy.checkpoint.directory) if policy.model.four_bits else {}
+    kept = np.zeros(2)
+
+    def merged(s: Source) -> np.ndarray:
+        as_read = names.read(jnp.asarray(read_tensor(stored[s.key])), s.turned) if stored else row_of(flat, s)
+        kernel = as_read.astype(dtype)
+        if s.path[-1] == "kernel" and s.path[:-1] in adapters:
+            of_layer = Adapter(*(x if s.row is None else x[s.row] for x in adapters[s.path[:-1]]))
+            kernel, shares = _merged_kernel(kernel, of_layer, policy.fns.lora)
+            kept[:] += shares
+        return names.write(kernel, s)
+
     with published(folder) as unfinished:
         for path in sorted(policy.checkpoint.directory.iterdir()):
             if path.is_file() and path.suffix in COPIED and path.name != INDEX:
                 shutil.copy(path, unfinished)
-        save_params(unfinished / SINGLE, merged, policy.checkpoint.config, progress)
+        save_tensors(unfinished, policy.checkpoint.config, merged, dtype, progress)
         write_file(unfinished / TOUCH_FILE, touch_tensors(saved.params))
-    return kept_share(base, whole, saved.params[ADAPTERS], policy.fns.lora)
+    return float(kept[0] / kept[1]) if kept[1] else 1.0
+
+
+_merged_kernel = jax.jit(merged_kernel, static_argnums=2)
 
 
 def of_checkpoint(adapters: Params) -> Params:

@@ -152,7 +152,7 @@ def adapted(scale: float) -> AbstractContextManager[None]:
 def merge(base: Params, adapters: Adapters, config: LoraConfig) -> Params:
     """Parameters with the adapters in them, W + s A B, computed in float32 and kept in the type of W.
 
-    A coarse type loses what moves a weight by less than half the distance to its neighbour: `kept_share` says how much.
+    A coarse type loses what moves a weight by less than half the distance to its neighbour (`merged_kernel`).
 
     Raises:
       ValueError: adapters of layers that the base lacks.
@@ -162,8 +162,7 @@ def merge(base: Params, adapters: Adapters, config: LoraConfig) -> Params:
     if strangers:
         raise ValueError(f"adapters {strangers[:3]} belong to no layer of the base; merge them into their own")
     for path, adapter in found.items():
-        kernel = flat[(*path, "kernel")]
-        flat[(*path, "kernel")] = (kernel.astype(jnp.float32) + _change(adapter, config)).astype(kernel.dtype)
+        flat[(*path, "kernel")], _ = merged_kernel(flat[(*path, "kernel")], adapter, config)
     return flax.traverse_util.unflatten_dict(flat)
 
 
@@ -173,28 +172,15 @@ def exported(params: Params, config: LoraConfig) -> Params:
     return merge(whole, params[ADAPTERS], config) if ADAPTERS in params else whole
 
 
-def kept_share(base: Params, merged: Params, adapters: Adapters, config: LoraConfig) -> float:
-    """Share of the adapters' change Δ that merged weights keep, ⟨W' − W, Δ⟩ / ⟨Δ, Δ⟩ over all layers.
+def merged_kernel(kernel: Array, adapter: Adapter, config: LoraConfig) -> tuple[Array, Float[Array, "2"]]:
+    """W' = W + Δ, computed in float32 and kept in the type of W, with ⟨W' − W, Δ⟩ and ⟨Δ, Δ⟩ for Δ = s A B.
 
-    1 where nothing is lost; near 0 where the weights' type is too coarse.  No change at all is kept whole.
-
-    Args:
-      base, adapters, config: as `merge` took them.
-      merged: what it gave.
+    The ratio of the two, also of their sums over layers, is the share of the change that is kept: 1 where nothing is
+    lost; near 0 where the type is too coarse.
     """
-    before, after = (flax.traverse_util.flatten_dict(tree) for tree in (base, merged))
-    along, whole = 0.0, 0.0
-    for path, adapter in by_layer(adapters).items():
-        w, v = (tree[(*path, "kernel")].astype(jnp.float32) for tree in (before, after))
-        change = _change(adapter, config)
-        along += float(jnp.vdot(v - w, change))
-        whole += float(jnp.vdot(change, change))
-    return along / whole if whole else 1.0
-
-
-def _change(adapter: Adapter, config: LoraConfig) -> Array:
-    """Change that an adapter adds to its kernel, s A B, in float32."""
-    return config.scale * adapter.a @ adapter.b
+    change, before = config.scale * adapter.a @ adapter.b, kernel.astype(jnp.float32)
+    after = (before + change).astype(kernel.dtype)
+    return after, jnp.stack([jnp.vdot(after.astype(jnp.float32) - before, change), jnp.vdot(change, change)])
 
 
 def _kernels(base: Params, config: LoraConfig) -> Iterator[tuple[tuple[str, ...], Any]]:

@@ -10,7 +10,7 @@ import pytest
 from tests.touchr1_jax import tiny
 from touchr1_jax.models.layers import GatedMLP
 from touchr1_jax.models.lm import Decoder
-from touchr1_jax.models.lora import LoraConfig, adapted, by_layer, init_adapters, kept_share, merge
+from touchr1_jax.models.lora import Adapter, LoraConfig, adapted, by_layer, init_adapters, merge, merged_kernel
 
 LORA = LoraConfig(rank=3, alpha=6.0)
 MLP = LoraConfig(rank=3, targets=("gate", "up", "down"))
@@ -181,10 +181,10 @@ def test_half_precision_base_stays_so(base):
     ],
 )
 def test_what_a_coarse_type_keeps_of_a_change_by_hand(dtype, change, kept):
-    base = {"decoder": {"q_proj": {"kernel": jnp.ones((1, 1), dtype)}}}
-    adapters = {"decoder": {"q_proj": {"a": jnp.array([[change]]), "b": jnp.array([[1.0]])}}}
-    lora = LoraConfig(rank=1, alpha=1.0)
-    assert kept_share(base, merge(base, adapters, lora), adapters, lora) == pytest.approx(kept)
+    adapter = Adapter(jnp.array([[change]]), jnp.array([[1.0]]))
+    after, (along, whole) = merged_kernel(jnp.ones((1, 1), dtype), adapter, LoraConfig(rank=1, alpha=1.0))
+    assert (after.dtype, float(whole)) == (dtype, change**2)
+    assert float(along) == pytest.approx(kept * change**2)
 
 
 def test_a_change_of_context_reaches_the_frozen_base():

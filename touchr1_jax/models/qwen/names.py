@@ -66,10 +66,10 @@ def read(published: Array, turned: bool) -> Array:
     return published.reshape(published.shape[0], -1).T if turned else published
 
 
-def write(parameter: np.ndarray, source: Source) -> np.ndarray:
-    """The published tensor from its parameter."""
-    of_layer = parameter if source.row is None else parameter[source.row]
-    return of_layer.T.reshape(source.shape) if source.turned else of_layer
+def write(parameter: Array, source: Source) -> np.ndarray:
+    """The published tensor from its parameter, or from its row of a stacked one."""
+    host = np.asarray(parameter)
+    return host.T.reshape(source.shape) if source.turned else host
 
 
 def canonical(key: str) -> str:

@@ -53,6 +53,14 @@ class TensorEntry(NamedTuple):
         return self.end - self.start
 
 
+class Deferred(NamedTuple):
+    """A tensor that is made when it is written."""
+
+    dtype: np.dtype
+    shape: tuple[int, ...]
+    make: Callable[[], np.ndarray]
+
+
 def read_header(path: Path) -> dict[str, TensorEntry]:
     """Tensors of a file.
 
@@ -92,9 +100,11 @@ def read_tensor(entry: TensorEntry) -> np.ndarray:
 
 
 def write_file(
-    path: Path, tensors: Mapping[str, np.ndarray], progress: ReportBytes = lambda done_bytes, all_bytes: None
+    path: Path,
+    tensors: Mapping[str, np.ndarray | Deferred],
+    progress: ReportBytes = lambda done_bytes, all_bytes: None,
 ) -> None:
-    """Write tensors to a file, whole or not at all.
+    """Write tensors to a file, whole or not at all, one after the other.
 
     Args:
       path: of the file.
@@ -102,7 +112,7 @@ def write_file(
       progress: called after each tensor.
 
     Raises:
-      ValueError: a tensor of a type that is not stored.
+      ValueError: a tensor of a type that is not stored, or a deferred one that is made unlike its description.
     """
     names = {dtype: name for name, dtype in STORED.items()}
     header: dict[str, dict[str, Any]] = {}
@@ -110,15 +120,19 @@ def write_file(
     for name, x in tensors.items():
         if x.dtype not in names:
             raise ValueError(f"{name} is {x.dtype}: must be one of {', '.join(map(str, names))}; cast it")
-        header[name] = {"dtype": names[x.dtype], "shape": x.shape, "data_offsets": (end, end + x.nbytes)}
-        end += x.nbytes
+        size = math.prod(x.shape) * x.dtype.itemsize
+        header[name] = {"dtype": names[x.dtype], "shape": x.shape, "data_offsets": (end, end + size)}
+        end += size
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 8)  # tensors start at a multiple of 8, as the format recommends
     partial = path.with_name(path.name + ".partial")
     with partial.open("wb") as file:
         file.write(struct.pack("<Q", len(text)) + text)
         for name, x in tensors.items():
-            np.ascontiguousarray(x).tofile(file)
+            made = x.make() if isinstance(x, Deferred) else x
+            if (made.dtype, made.shape) != (x.dtype, x.shape):
+                raise ValueError(f"{name} is {made.dtype} {made.shape}: must be {x.dtype} {x.shape}; correct it")
+            np.ascontiguousarray(made).tofile(file)
             progress(header[name]["data_offsets"][1], end)
     os.replace(partial, path)
 

@@ -28,6 +28,9 @@ from touchr1_jax.types import Params
 SINGLE = "model.safetensors"
 INDEX = "model.safetensors.index.json"
 HEAD, EMBEDDING = "lm_head.weight", "text.embed_tokens.weight"
+SHARD_BYTES = 2_000_000_000
+"""Size of a shard that is written."""
+
 SHOWN = 12
 """How many misfits an error lists before it counts the rest."""
 
@@ -150,15 +153,15 @@ def compare(
 
 
 def save_params(
-    path: Path,
+    directory: Path,
     params: Params,
     config: QwenConfig,
     progress: safetensors.ReportBytes = lambda done_bytes, all_bytes: None,
 ) -> None:
-    """Write parameters to one file with the published keys, in their own type.
+    """Write parameters as `save_tensors`, in their own type.
 
     Args:
-      path: of the file.
+      directory: of the files.
       params: the tree of `QwenVL`.
       config: its shapes.
       progress: called after each tensor.
@@ -169,9 +172,57 @@ def save_params(
     flat, wanted = flax.traverse_util.flatten_dict(params), sources(config)
     if differ := sorted("/".join(p) for p in flat.keys() ^ {s.path for s in wanted.values()}):
         raise ValueError(f"params and config differ in {', '.join(differ[:SHOWN])}; save with the config of the params")
-    host = {name: np.asarray(x) for name, x in flat.items()}
-    tensors = {published(s.key, config): names.write(host[s.path], s) for s in wanted.values()}
-    safetensors.write_file(path, tensors, progress)
+    dtype = jnp.result_type(*flat.values())
+    save_tensors(directory, config, lambda s: names.write(row_of(flat, s), s), dtype, progress)
+
+
+def row_of(flat: Mapping[names.Path, Array], s: Source) -> Array:
+    """The parameter of a published tensor, or its row of a stacked one."""
+    return flat[s.path] if s.row is None else flat[s.path][s.row]
+
+
+def save_tensors(
+    directory: Path,
+    config: QwenConfig,
+    tensor: Callable[[Source], np.ndarray],
+    dtype: jnp.dtype,
+    progress: safetensors.ReportBytes = lambda done_bytes, all_bytes: None,
+    shard_bytes: int = SHARD_BYTES,
+) -> int:
+    """Write a checkpoint in the published layout, never more than one tensor in memory; return the bytes of tensors.
+
+    Args:
+      directory: of the shards and their index, or of the one file.
+      config: shapes and published keys.
+      tensor: a published tensor, made when it is written.
+      dtype: of all tensors.
+      progress: called after each tensor.
+      shard_bytes: size of a shard at most, but for a larger tensor.
+    """
+    of_type, filled, size = np.dtype(dtype), 0, 0
+    shards: list[dict[str, safetensors.Deferred]] = [{}]
+    for s in sources(config).values():
+        needed = math.prod(s.shape) * of_type.itemsize
+        if filled and filled + needed > shard_bytes:
+            shards.append({})
+            filled = 0
+        shards[-1][published(s.key, config)] = safetensors.Deferred(of_type, s.shape, functools.partial(tensor, s))
+        filled, size = filled + needed, size + needed
+    files = [f"model-{i + 1:05}-of-{len(shards):05}.safetensors" for i in range(len(shards))]
+    files, done = files if len(shards) > 1 else [SINGLE], 0
+    for file, shard in zip(files, shards, strict=True):
+        safetensors.write_file(directory / file, shard, _of_all(done, size, progress))
+        done += sum(math.prod(x.shape) * of_type.itemsize for x in shard.values())
+    if len(shards) > 1:
+        place = {name: file for file, shard in zip(files, shards, strict=True) for name in shard}
+        index = {"metadata": {"total_size": size}, "weight_map": place}
+        (directory / INDEX).write_text(json.dumps(index), encoding="utf-8")
+    return size
+
+
+def _of_all(before: int, size: int, progress: safetensors.ReportBytes) -> safetensors.ReportBytes:
+    """Progress of one shard as that of all."""
+    return lambda done, _: progress(before + done, size)
 
 
 def _raw_tensors(directory: Path) -> dict[str, safetensors.TensorEntry]:

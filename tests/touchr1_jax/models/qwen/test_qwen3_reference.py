@@ -48,7 +48,7 @@ def test_a_checkpoint_of_transformers_is_read_and_written_back(reference, tmp_pa
     name, folder, _ = reference
     config = read_config(folder / "checkpoint")
     assert config == tiny.config_of(CASES[name])
-    save_params(tmp_path / "model.safetensors", load_params(folder / "checkpoint", config, jnp.float32), config)
+    save_params(tmp_path, load_params(folder / "checkpoint", config, jnp.float32), config)
     theirs, ours = (read_header(path / "model.safetensors") for path in (folder / "checkpoint", tmp_path))
     assert theirs.keys() == ours.keys()
     for key, entry in theirs.items():

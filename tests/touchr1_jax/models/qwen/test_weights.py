@@ -16,8 +16,9 @@ from touchr1_jax.distributed.rules import state_shardings
 from touchr1_jax.models.nf4 import quantised
 from touchr1_jax.models.qwen.config import released
 from touchr1_jax.models.qwen.model import abstract_params, init_params
-from touchr1_jax.models.qwen.safetensors import write_file
-from touchr1_jax.models.qwen.weights import load_params, save_params
+from touchr1_jax.models.qwen.names import published
+from touchr1_jax.models.qwen.safetensors import read_header, write_file
+from touchr1_jax.models.qwen.weights import load_params, save_params, save_tensors
 
 CASE = CASES["text_untied"]
 CONFIG = tiny.config_of(CASE)
@@ -117,16 +118,35 @@ def test_tensors_are_cast(tmp_path, weights, stored, wanted):
 
 
 def test_parameters_are_saved_as_published(tmp_path, weights, expected):
-    save_params(tmp_path / "model.safetensors", expected, CONFIG)
+    save_params(tmp_path, expected, CONFIG)
     assert_equal(load_params(tmp_path, CONFIG, jnp.float32), expected)
     write_file(tmp_path / "reference.safetensors", weights)
     sizes = {path.stat().st_size for path in tmp_path.iterdir()}
     assert len(sizes) == 1
 
 
+def test_a_checkpoint_is_written_in_shards_one_tensor_at_a_time(tmp_path, weights, expected):
+    seen, made = [], []
+
+    def tensor(source):
+        made.append(source.key)
+        return weights[published(source.key, CONFIG)]
+
+    size = save_tensors(tmp_path, CONFIG, tensor, jnp.dtype(np.float32), lambda *x: seen.append(x), shard_bytes=30_000)
+    assert size == sum(x.nbytes for x in weights.values())
+    assert len(made) == len(seen) == len(weights)
+    assert seen[-1] == (size, size)
+    shards = [read_header(path) for path in sorted(tmp_path.glob("*.safetensors"))]
+    assert len(shards) > 2
+    assert all(len(shard) == 1 or sum(entry.size for entry in shard.values()) <= 30_000 for shard in shards)
+    assert_equal(load_params(tmp_path, CONFIG, jnp.float32), expected)
+    with pytest.raises(ValueError, match="must be float32"):
+        save_tensors(tmp_path, CONFIG, lambda source: tensor(source)[:1], jnp.dtype(np.float32))
+
+
 def test_only_whole_trees_are_saved(tmp_path, expected):
     with pytest.raises(ValueError, match="params and config differ in decoder/head/kernel"):
-        save_params(tmp_path / "model.safetensors", expected, tiny.config_of(CASES["text"]))
+        save_params(tmp_path, expected, tiny.config_of(CASES["text"]))
 
 
 def misfit(tmp_path, weights) -> str:
