@@ -8,14 +8,17 @@ import pytest
 from rich.console import Console
 
 from experiments.core.context import Context
+from experiments.core.errors import DataError
 from experiments.study import sources
 from experiments.study.dataset import split_parts
 from experiments.study.sources import SourceConfig, odd_contacts, prepare_records
+from experiments.study.training import open_data
 from sensors_io.importers.physiclear import PhysiclearConfig
 from sensors_io.locks import RecordsBusyError
 from sensors_io.records import RecordWriter
 from sensors_io.scenes.config import SceneConfig, config_hash
 from tests.experiments import tiny
+from tests.sensors_io import fakes
 
 GENERATED = SourceConfig(scenes=tiny.SCENES)
 
@@ -112,3 +115,14 @@ def test_odd_contacts_of_recordings_are_listed_before_training_and_left_out_on_r
     parts = split_parts(store, 0.35, left_out=(black,))
     assert set(np.concatenate(list(parts.values()))) == set(range(len(store))) - {black}
     assert odd_contacts(GENERATED, store.path, context) == ()
+
+
+def test_records_of_a_sensor_that_answers_cannot_name_are_refused(tmp_path, context):
+    meta = dataclasses.replace(fakes.META, sensors=("digit",))
+    with RecordWriter(tmp_path / "digit", meta=meta) as writer:
+        for n in range(4):
+            writer.write_object(fakes.card(n))
+            writer.write_contact([dataclasses.replace(fakes.sequence(n), sensor="digit")])
+    config = dataclasses.replace(tiny.STUDY, data="records", data_dir=tmp_path / "digit")
+    with pytest.raises(DataError, match="digit holds records of digit: answers name gelsight_mini, xense"):
+        open_data(config, 32, context)
