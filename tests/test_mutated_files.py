@@ -21,7 +21,7 @@ from sensors_io.calibration.geometry import CameraGeometry
 from sensors_io.commands import label
 from sensors_io.errors import UserError
 from sensors_io.importers.hdf5 import HDF5Config, list_hdf5
-from sensors_io.importers.hdf5_inspect import describe, propose
+from sensors_io.importers.hdf5_inspect import inspect
 from sensors_io.importers.keep import ImportSourceError, Keep
 from sensors_io.importers.octopi import list_octopi
 from sensors_io.importers.physiclear import read_labels
@@ -83,8 +83,7 @@ def hdf5(folder):
 
     def parse(data):
         path.write_bytes(data)
-        describe(path)
-        propose(path)
+        inspect([path])
         read(write_map(folder, layout))
 
     whole = path.read_bytes()
