@@ -306,9 +306,9 @@ class _Rows:
                 f"{self.array.path} reaches {greatest:.3g} as {name}: a sensor gives {bound}; is the unit "
                 f"{self.array.unit!r}?"
             )
-        if name == "force_n" and (pull := float(np.nanmax(found[:, 2], initial=0.0))) > max(
-            LEAST_PULL_N, float(-np.nanmin(found[:, 2], initial=0.0))
-        ):
+        z = found[:, 2][np.isfinite(found[:, 2])] if name == "force_n" else np.zeros(0)
+        pull = float(z.max(initial=0.0))
+        if pull > max(LEAST_PULL_N, float(-z.min(initial=0.0))):
             raise HDF5Error(
                 f"{self.array.path} reaches Fz = +{pull:.3g} N, which pulls at the gel: a press has Fz < 0; turn the "
                 "sign of z in `components`"
