@@ -177,9 +177,9 @@ class Algorithm:
 
 
 def ratio_to_learner(algorithm: Algorithm) -> bool:
-    """True where ratios are to the learner before its first update, false where to the older parameters that sampled.
+    """True if ratios are relative to the learner before its first update, false if to the older sampling parameters.
 
-    Under an importance cap the weights correct for the lag, as in the decoupled objective of AReaL (arXiv 2505.24298).
+    With an importance cap, weights correct for the lag, as in the decoupled objective of AReaL (arXiv 2505.24298).
     """
     return algorithm.stale == 0 or algorithm.importance_cap is not None
 
@@ -190,7 +190,7 @@ def loss_beta(algorithm: Algorithm) -> float:
 
 
 def left_out(weight: float | jax.Array) -> bool:
-    """True for a term that is not computed: its weight is the number 0, and no array that may hold another."""
+    """True for a term that is not computed: its weight is the number 0, not an array that may have another value."""
     return not isinstance(weight, jax.Array) and weight == 0.0
 
 
@@ -308,8 +308,8 @@ AnyAlgorithm = Paper | Stable | Dapo | DrGrpo | Gspo | Cispo | Rloo | ReinforceP
 class GRPOConfig:
     """Sizes, learning rate and algorithm of a step.
 
-    `lr_scale` multiplies the paper's learning rate, at which models trained from scratch do not move; the rate falls
-    linearly to `final_share` of itself (not in the paper).
+    `lr_scale` multiplies the paper's learning rate, which is too small for models trained from scratch; the rate falls
+    linearly to `final_share` of its start (not in the paper).
     """
 
     prompts: int = 8
