@@ -133,7 +133,7 @@ CLAIMS: tuple[Claim, ...] = (
         text="The consistency reward raises cross-sensor consistency",
         experiment="ablation_cumulative",
         changes=(_ladder("CSC", "consistency", "ordinal", "+ Consistency Reward", "+ Ordinal Reward", csc=True),),
-        why="The reward pays for equal slots: slots copy each other; conclusions from single sensors stay the same.",
+        why="It rewards equal slots, so slots copy each other; conclusions from single sensors stay the same.",
     ),
     Claim(
         text="The format reward brings a small but stable gain",
@@ -176,7 +176,7 @@ CLAIMS: tuple[Claim, ...] = (
         experiment="ablation_cumulative",
         published="no row",
         changes=(ClaimedChange(name="Avg of four", metrics=FOUR, arm="tactile_use", against="grounding"),),
-        why="No equation of the paper contains it; implemented here as the abstract describes it.",
+        why="In no equation of the paper; implemented here as its abstract describes.",
     ),
     Claim(
         text="Touch overrules a misleading picture",
@@ -226,7 +226,7 @@ CLAIMS: tuple[Claim, ...] = (
                 spec=".3f",
             ),
         ),
-        why="Prediction is better than copying. The unit of the paper's L1 is unknown, so no comparison is possible.",
+        why="Prediction is better than copying. The paper's L1 has an unknown unit and cannot be compared.",
     ),
     Claim(
         text="Pretraining on future frames captures contact",

@@ -122,7 +122,7 @@ def sensor_evidence(
       config: folds and fit.
       track: passes the (attribute, sensor) pairs through, for example under a progress bar.
       read_only: rows of other groups that no probe is fitted on and that a probe of all other rows reads; none by
-      default.
+        default.
     """
     n, sensors = present.shape
     read_only = np.zeros(n, bool) if read_only is None else read_only

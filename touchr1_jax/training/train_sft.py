@@ -38,11 +38,11 @@ class SFTConfig:
     questions: int = 2
     """Questions per contact and step; the contact is encoded once for all of them."""
     save_every: int = 100
-    """Steps between checkpoints, and between the points of which the best on validation objects is kept."""
+    """Steps between checkpoints; the best checkpoint on validation objects is kept."""
     micro_contacts: int = 2
     """Contacts of a micro-batch of the gradient; two stay in cache, which on a CPU is a third faster than sixteen."""
     max_logits: int = MAX_LOGITS
-    """Logits that may exist at once; more tokens than that are scored in blocks."""
+    """Logits that may exist at once; larger inputs are scored in blocks."""
     pack: int = 0
     """Tokens of a row that several questions with their answers share; 0 pads each to the longest instead."""
     remat: bool = False
