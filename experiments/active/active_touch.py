@@ -7,22 +7,21 @@ motion at two forces.  A policy receives a question about one of five properties
 touches again or concludes.  SFT on random touches comes first; it does not show which touch is good.  GRPO on whole
 trajectories then rewards the right answer, minus a price for seconds and for harm (contacts that strain the gel or the
 object past its limit).  The report first gives the largest possible gain from choosing, by probes and by the policy's
-own beliefs.  Controls: touches at random, the best press, the best touch for all questions, the best touch for
-each question (all looked up on validation objects), a look-up order with a threshold on belief, imitation of a one-step
-look-ahead, a policy whose observations are hidden while it chooses, every touch, the exact optimum over trees.
+own beliefs.  Controls: random touches; the best press, the best touch for all questions and the best touch for each
+question (looked up on validation objects); a fixed order that stops at a threshold on belief; imitation of a one-step
+look-ahead; a policy that chooses without seeing its observations; every touch; the exact optimum over decision trees.
 
 `--physiclear DIR` adds real touch: several videos of an object as contacts, and a policy that learns when to stop.
 `--agents` adds PPO of Stable-Baselines3 in the same environment.
 
-Sensors and motions also drop out of objects at random, unknown to plans and policies: a contact without them takes its
-time and returns nothing.
+For each object, some sensors and motions are missing at random, and policies are not told which: a touch with a missing
+one takes its time and returns nothing.
 
-Cost: 24 to 28 minutes on two cores, six to eight of them for the contacts, which are made once (`smoke` two
-minutes).
+Cost: 24 to 28 minutes on two cores, six to eight of them for the contacts, which are made once; `--scale smoke` two.
 
 Expected: one touch chosen by reward is seven points better than the best touch for all questions and as good as the
-best touch for each question, also where choices drop out.  A second touch adds little except where the first one
-returned nothing, and a policy with a price on harm avoids harm and answers as well.
+best touch for each question, also with missing choices.  A second touch adds little unless the first one returned
+nothing.  A policy with a price on harm avoids harm without loss of accuracy.
 """
 
 import dataclasses

@@ -3,8 +3,8 @@
     pip install 'touchr1-jax[agents]'
     python -m experiments active_touch --agents
 
-It learns from all objects that the policies learn from, by `rl.gymnasium_env`, pays the same prices, and its settings
-are chosen by its reward on validation objects.
+The agent learns through `rl.gymnasium_env` from the training objects of the policies and pays the same prices.  Its
+settings are those with the most reward on validation objects.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""One seed of `active_touch`: warm start, reinforced policies, controls, and what all of them do about test objects."""
+"""One seed of `active_touch`: warm start, reinforced policies, controls, and their trajectories on test objects."""
 
 import dataclasses
 from collections.abc import Mapping

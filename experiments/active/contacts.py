@@ -1,7 +1,7 @@
-"""Generated objects, each touched by every motion at every force by every sensor: what a policy may choose.
+"""Generated objects, each touched with every sensor, motion and force: the choices of a policy.
 
-A choice is (sensor, motion, force).  What is kept of a contact is a few frames, and whether gel or object was strained
-past the limit of small strains.  The generator knows the level of all five properties.
+A choice is (sensor, motion, force).  Of each contact, a few frames are stored, and whether the strain of gel or object
+exceeded the limit of small strains.  The generator knows the level of all five properties.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""Cost of a step on trajectories next to that of a step on one answer of as many tokens."""
+"""Cost of a step on trajectories, compared with a step on single answers of as many tokens."""
 
 import dataclasses
 from collections.abc import Callable

@@ -1,7 +1,7 @@
 """Beliefs about single contacts by a network that reads fixed statistics of patches, and tokens made of beliefs.
 
-The network learns all five properties from every contact at once.  It never sees the measured force, in which friction
-could simply be read.
+The network learns all five properties of a contact at once.  It never sees the measured force, which would directly
+show friction.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""From what all plans and policies did to the results of `active_touch`."""
+"""Results of `active_touch`, computed from the trajectories of all plans and policies."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

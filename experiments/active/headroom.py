@@ -1,8 +1,8 @@
-"""Headroom, the gain that choosing can bring: plans of one, two and three contacts, from beliefs about every contact.
+"""Headroom, the largest gain from choosing: plans of one, two and three contacts, by beliefs about every contact.
 
-A belief is the log-probability of each level given one contact; those of several contacts are added, as if their errors
-were independent.  A plan is worth its right answers less the cost of its contacts.  It is looked up on some objects and
-scored on others.
+A belief is the log-probability of each level given one contact; beliefs of several contacts are added, as if their
+errors were independent.  The value of a plan is its right answers minus the cost of its contacts.  A plan is chosen on
+some objects and scored on others.
 """
 
 import dataclasses

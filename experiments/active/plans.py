@@ -1,4 +1,4 @@
-"""Controls: contacts that are chosen by a rule, and answered for by a policy that was never taught what to choose."""
+"""Controls: a rule chooses the contacts, and a policy that never learned to choose answers."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Policies that choose: warm start on touches drawn at random, GRPO on whole trajectories, and what they then do."""
+"""Policies that choose: warm start on random touches, GRPO on whole trajectories, evaluation."""
 
 import dataclasses
 import functools

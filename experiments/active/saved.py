@@ -1,9 +1,9 @@
-"""A trained policy that chooses its touches, with the readers of its contacts, as a folder.
+"""A folder with a trained policy that chooses its touches and the networks that read its contacts.
 
-DIR/config.json         choices, sizes, what is kept of a contact, most contacts of a trajectory, checksum
+DIR/config.json         choices, sizes, stored frames of a contact, most contacts of a trajectory, checksum
 DIR/model.safetensors   parameters of the policy and of the readers
 
-A saved policy observes beliefs of the readers alone: the probes that were averaged with them in training are not kept.
+In training, beliefs are averaged over networks and probes; a saved policy uses only the networks.
 """
 
 import dataclasses

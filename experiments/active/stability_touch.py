@@ -2,15 +2,15 @@
 
     python -m experiments stability_touch [--scale smoke]
 
-Trains the one-touch policy of `active_touch` with ten seeds, on the same contacts and readers.  Each seed trains on
-random touches by SFT and then learns from reward; no label gives the best touch.  A seed solves a question if the most
-frequent first motion on test objects is the best by linear probes, or lies within the interval of the best.  The report
-lists the alarms of exploring policies (A1 to A5) that fired during training.
+The one-touch policy of `active_touch` is trained with ten seeds, on the same contacts and networks that read them.
+Each seed trains on random touches by SFT and then learns from reward; no label gives the best touch.  A seed solves a
+question if its most frequent first motion on test objects is the best by linear probes, or within its interval.  The
+report lists the alarms of exploring policies (A1 to A5) that fired during training.
 
-Cost: five minutes of CPU time a seed, and the contacts, thirteen minutes once (`smoke` one minute).
+Cost: five minutes of CPU time per seed, and thirteen once for the contacts; `--scale smoke` one minute.
 
-Expected: four of five questions in at least eight of ten seeds.  In half of the seeds A4 fires early, until the policy
-tells the questions apart.
+Expected: at least eight of ten seeds solve four of five questions.  In half of the seeds, A4 fires early, until the
+policy distinguishes the questions.
 """
 
 import dataclasses

@@ -1,8 +1,8 @@
 """Real touch: several videos of an object as contacts, and a policy that learns from reward when to stop.
 
-Videos of one motion tell the policy nothing about what to choose, so that all of its choice is the number.  Each fold
-of the objects is answered for by readers, a warm start and a reinforced policy that learned from the other folds; what
-a reader says of an object that training uses was learned from other objects.
+All videos show one motion, so the policy chooses only how many to see.  For each fold of the objects, readers, warm
+start and reinforced policy learn from the other folds.  A reader's beliefs about a training object come from a reader
+that learned from other objects.
 """
 
 import dataclasses

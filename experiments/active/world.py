@@ -1,4 +1,4 @@
-"""The world in which a policy chooses: encoded contacts, which objects serve for what, and what probes know."""
+"""The data of a policy that chooses: encoded contacts, the split of the objects, and beliefs of probes."""
 
 import dataclasses
 import functools

@@ -133,8 +133,8 @@ def average_check(main: MainTable) -> StatementCheck:
         "main table, Avg “over the full metric set”",
         f"Avg {average[-1]} for {OURS}",
         f"the plain mean is {plain[-1]:.1f}; every weighted mean misses at least one model by {miss:.2f} points, even "
-        "allowing for rounding; weights with any sum fit the twelve rows, but give a perfect model at most "
-        f"{perfect_average(main):.0f} points",
+        "allowing for rounding; weights that need not sum to 1 fit the twelve rows, but a perfect model then gets at "
+        f"most {perfect_average(main):.0f} points",
         miss > SOLVER_ERROR,
     )
 
@@ -277,8 +277,8 @@ def _data_and_units() -> Iterator[StatementCheck]:
         "Shares that no count gives",
         f"VTV150K table, four properties of {paper.VTV_ITEMS} questions",
         f"{', '.join(str(share) for share in shares['Ours'])} for Touch-R1",
-        f"{fit['Ours']} of its 4 equal k/{paper.VTV_ITEMS} to one decimal; of the others' {4 * (len(fit) - 1)}, "
-        f"{others} do",
+        f"{fit['Ours']} of its 4 equal k/{paper.VTV_ITEMS} to one decimal, {others} of the "
+        f"{4 * (len(fit) - 1)} of other models do",
         fit["Ours"] < 4,
         "unsupported",
     )
@@ -287,8 +287,8 @@ def _data_and_units() -> Iterator[StatementCheck]:
         "L1 worse than a grey picture's",
         "video prediction table",
         f"L1 {min(errors)} to {max(errors)}",
-        f"on pictures in 0–1 a constant ½ has an L1 of at most ½; {sum(e > 0.5 for e in errors)} of {len(errors)} "
-        "values are above, so their unit is unknown",
+        f"if pixels are in 0–1, a grey picture has an L1 of at most ½; {sum(e > 0.5 for e in errors)} of {len(errors)} "
+        "values are larger, so their unit is unknown",
         min(errors) > 0.5,
         "not given",
     )

@@ -1,7 +1,7 @@
-"""Known failures of reinforcement learning from touch: for each the knob that drives it and when a seed has failed.
+"""Known failures of reinforcement learning from touch: the parameter that provokes each, and when a seed has failed.
 
-F1 … F13 are the codes of `touchr1_jax.rl.alarms`.  Each criterion measures one failure alone and was fixed before the
-runs that are reported.
+F1 … F13 are the codes of `touchr1_jax.rl.alarms`.  Each criterion measures one failure only and was fixed before the
+reported runs.
 """
 
 import dataclasses

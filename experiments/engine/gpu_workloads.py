@@ -1,7 +1,7 @@
 """Workloads that are timed on an accelerator: a matrix product, attention, both encoders, decoding, a GRPO step.
 
-Each comes with the operations that it must do, counted from shapes without anything that a program computes twice; for
-the encoders it is XLA's count of the program before compilation.
+Each workload states its necessary operations, counted from shapes without recomputation; for the encoders, this is
+XLA's count for the program before compilation.
 """
 
 import dataclasses

@@ -1,7 +1,7 @@
-"""Options of the GRPO step, each alone against the published objective, in the small world of touch.
+"""Options of the GRPO step, each compared alone with the published objective, in the simulated world of touch.
 
-Every option is a `GrpoVariant`: a policy is supervised, then reinforced by the library's own step, as in
-`stability_grpo`, many seeds as one program.
+Every option is a `GrpoVariant`: as in `stability_grpo`, the library's own step trains policies by SFT, then GRPO, many
+seeds as one program.
 """
 
 import dataclasses

@@ -1,10 +1,10 @@
-"""TRL's GRPO trainer on the common job, on the CPU; run by an interpreter that has TRL.
+"""TRL's GRPO trainer on the timed job (`job.py`), on the CPU, run by an interpreter that has TRL.
 
     python3.11 -m venv TRL && TRL/bin/pip install -c constraints.txt trl==1.16.0 torch
     make experiment EXP=speed_grpo ARGS="--trl-python TRL/bin/python"
 
-or, in this project's own environment, `pip install -c constraints.txt -e '.[speed]'`.  TRL is imported inside the
-functions, since the rest of the project has to do without it.
+or, in this project's environment, `pip install -c constraints.txt -e '.[speed]'`.  Functions import TRL, because the
+rest of the project does not need it.
 """
 
 import tempfile

@@ -1,10 +1,10 @@
-"""Tunix's GRPO learner on the common job, on the CPU, with its own JAX sampler; run by an interpreter that has Tunix.
+"""Tunix's GRPO learner and sampler on the timed job (`job.py`), on the CPU, run by an interpreter that has Tunix.
 
     python3.11 -m venv TUNIX && TUNIX/bin/pip install google-tunix==0.1.7
     make experiment EXP=speed_grpo ARGS="--tunix-python TUNIX/bin/python"
 
-An environment of its own is needed: Tunix pins other versions of JAX's companions than this project.  It is imported
-inside the functions, since the rest of the project has to do without it.
+Tunix needs a separate environment, because it pins other versions of JAX's companions than this project.  Functions
+import Tunix, because the rest of the project does not need it.
 """
 
 import time

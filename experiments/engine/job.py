@@ -1,4 +1,4 @@
-"""The job that GRPO engines are timed on: one decoder, one set of prompts, completions and updates for all of them.
+"""The job on which GRPO engines are timed: the same decoder, prompts, completions and updates for all engines.
 
 8 prompts × 8 rollouts × 64 new tokens, no end token among them; a decoder of the Qwen2 shape with 1.05 million
 parameters (4 layers, width 128, 4 heads over 2 key heads of 32, MLP 512, vocabulary 512, tied embedding) in float32;

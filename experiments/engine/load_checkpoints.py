@@ -1,6 +1,6 @@
-"""Checkpoints of random weights in the published layout, and readers of them, each measured in a process of its own.
+"""Checkpoints of random weights in the published layout, and readers, each measured in its own process.
 
-This module imports little, since what it imports adds to the memory of the process that is measured.
+This module imports little, because imports add to the measured memory.
 """
 
 import dataclasses

@@ -2,12 +2,14 @@
 
     python -m experiments load_weights [--scale smoke] [--sizes 3B 7B] [--scratch DIR]
 
-Writes a checkpoint of a released shape with random contents in bfloat16, reads it in a process of its own, and compares
-the largest resident size of that process with the size of the weights; for the sizes in `compare` also for a reader
-that reads all tensors first.  The 7B shape takes 17 GB of disk and of memory and some minutes; a machine that has less
-is refused before the run begins.
+The experiment writes a checkpoint of a released shape with random contents in bfloat16, reads it in a separate process,
+and compares the largest resident size of that process with the size of the weights; for the sizes in `compare`, also
+with a reader that first loads all tensors.  If the machine has too little disk or memory, the run ends before it
+begins to write.
 
-Expected: at most 1.2 times the weights from 0.5B to 7B; twice with all tensors first.
+Cost: for the 7B shape, 17 GB of disk, 17 GB of memory and some minutes.
+
+Expected: at most 1.2 times the weights from 0.5B to 7B; twice the weights if all tensors are loaded first.
 """
 
 import dataclasses

@@ -1,7 +1,7 @@
-"""Time of an iteration's matrix products: each shape of the traced program, timed alone on warm operands.
+"""Time of an iteration's matrix products: each shape of the traced program, timed alone with operands in cache.
 
-On a quiet machine the sum estimates the least time of these shapes, and what an iteration takes beyond it is other
-work.  Under load it is no bound: an iteration has been faster.
+On an idle machine, the sum estimates the least time of these products; the rest of an iteration is other work.  On a
+busy machine, the sum is no bound: iterations have been faster.
 """
 
 import math

@@ -2,14 +2,14 @@
 
     make experiment EXP=pareto [ARGS="--others DIR"]
 
-Reads the newest finished run of every experiment that measures speed against error, compares each default with the
-other rows of its table, and shows the charts of these runs, with those of the experiments that measure where methods
-break.  Where an experiment has not run here beyond `smoke`, its recorded result takes that place, without charts.
-`pareto` measures nothing itself: run the other experiments first.
+The experiment reads the newest finished run of every experiment that measures speed and error, compares each default
+with the other rows of its table, and shows the charts of these runs and of the experiments that measure the limits of
+methods.  If an experiment has not run here beyond `smoke`, its recorded result is used, without charts.  `pareto`
+measures nothing itself: run the other experiments first.
 
 Cost: a second.
 
-Expected: no default is dominated except where another rule chose it, such as the smallest of those fast enough.
+Expected: no default is dominated, unless another rule chose it, such as the smallest method that is fast enough.
 """
 
 import dataclasses

@@ -1,23 +1,23 @@
-"""Which GRPO algorithm and group size reach a given score in the least time, and how long does a step of each take?
+"""Which GRPO algorithm and group size reach a given score in the least time, and how long does each step take?
 
     make experiment EXP=pareto_grpo [ARGS="--scale smoke"]
 
 Every preset at every group size learns to write low token ids (see `experiments.engine.job`) from the same decoder and
 prompts, at one learning rate, with the same number of rollouts and steps: a larger group has fewer prompts.  The score
-is the mean reward over the last tenth of the steps; a run reaches the target at the first step whose mean reward passes
-it.  Time is the number of steps times the median time of a step, which is measured in rounds with all other programs,
-so that compilation and other load on the machine do not count.  If a preset skips groups, the reward is the mean over
-all sampled rollouts, so that presets are comparable.
+is the mean reward over the last tenth of the steps; a run reaches the target at the first step whose mean reward
+exceeds it.  Time is the number of steps times the median time of a step.  Step times are measured in rounds over all
+programs, so that compilation and other load on the machine do not count.  If a preset skips groups, the reward is the
+mean over all sampled rollouts, so that presets are comparable.
 
-Options of sampling, advantage, reward, lag and reference are charted one by one against the published objective in the
-small world of touch, by accuracy and time (see `experiments.engine.grpo_options`).
+Each option of sampling, advantage, reward, lag and reference is compared with the published objective in the simulated
+world of touch, by accuracy and time (see `experiments.engine.grpo_options`).
 
 Cost: 37 minutes in the recorded run on one core, most of it compilation; `--scale smoke` under two.
 
-Expected: on policy all clipped surrogates have the same gradient, so presets differ only in their averages and weights:
-Dr. GRPO and the token means equal GRPO up to scale where all completions have one length; dynamic sampling draws twice
-the rollouts although the rewards of few groups are equal here; the controls of `stable` take time and bring nothing to
-a task without touch.
+Expected: on policy, all clipped surrogates have the same gradient, so presets differ only in averages and weights.  Dr.
+GRPO and the token means equal GRPO up to scale, because all completions have one length; dynamic sampling draws twice
+the rollouts, although few groups have equal rewards here; the controls of `stable` take time and gain nothing in a task
+without touch.
 """
 
 import dataclasses

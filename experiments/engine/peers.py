@@ -1,8 +1,8 @@
-"""Other GRPO engines on the timed job of `experiments.engine.job`: its size, the processes that run it, their answers.
+"""Other GRPO engines on the timed job of `experiments.engine.job`: its size, the processes that run it, their results.
 
-A peer engine may live in an environment of its own, whose interpreter runs `python -m experiments.engine.harness_NAME
-JOB` in this checkout: so nothing but Python's standard library is imported here.  A harness gets the job as JSON and
-prints one line.
+A peer engine may need its own environment, whose interpreter runs `python -m experiments.engine.harness_NAME JOB` in
+this checkout, so this module imports only Python's standard library.  A harness gets the job as JSON and prints one
+line.
 """
 
 import dataclasses

@@ -1,8 +1,8 @@
 """The timed job of `job.py` as a plain JAX program: one jitted function that samples, scores and updates.
 
-Every pass encodes a prompt once, and its group shares the keys and values.  Beyond that there is what a JAX user writes
-at first: a scan over the tokens of all rollouts, all logits of a micro-batch at once, gradients by `jax.grad`.
-Prompts, positions and first parameters are the job's, so that both compute the same.
+Every pass encodes a prompt once, and its group shares the keys and values.  The rest is what a JAX user would write
+first: a scan over the tokens of all rollouts, all logits of a micro-batch at once, gradients by `jax.grad`.  Prompts,
+positions and initial parameters are those of the job, so that both programs compute the same.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Work in a process of its own, and its progress."""
+"""Work in a separate process, and its progress."""
 
 import concurrent.futures
 import functools

@@ -1,12 +1,12 @@
-"""Shapes of the published training and its layouts over devices, compiled for devices that are not there.
+"""Shapes of the published training and its layouts over devices, compiled without the devices.
 
 Touch-R1 (arXiv 2605.27154) trains Qwen2.5-VL 7B on 16 H200 with 8 frames of 448² pixels from four sensors and groups of
-eight.  A frame of 448² is 16 · 16 tokens of Qwen2.5-VL, which reads two frames at a time: 4 · 256 tokens a sensor, and
-256 for the view.  Lengths of question and answer are not published; here 128 and 512.
+eight.  A frame of 448² has 16 · 16 tokens of Qwen2.5-VL, which reads two frames at a time: 4 · 256 tokens per sensor,
+and 256 for the view.  Lengths of question and answer are not published; here they are 128 and 512.
 
-For `cpu` XLA simulates the devices; it computes products of bfloat16 in float32, so its temporary memory is an upper
-bound.  For `h200` XLA's GPU compiler gets a description of the machine, which needs NVIDIA's compiler and JAX's plugin
-for CUDA but no GPU: it reserves what a step needs there.
+With `cpu`, XLA simulates the devices; it computes products of bfloat16 in float32, so its temporary memory is an upper
+bound.  With `h200`, XLA's GPU compiler gets a description of the machine and states the memory that a step needs there;
+this needs NVIDIA's compiler and JAX's CUDA plugin but no GPU.
 """
 
 import contextlib

@@ -3,18 +3,18 @@
     python -m experiments scale_paper [--scale smoke] [--compiler h200]
 
 Touch-R1 trained Qwen2.5-VL 7B on sixteen H200 with 8 frames of 448² from four sensors and groups of eight.  Here the
-same step, with the reference and the counterfactual policy, is compiled for sixteen devices without weights and without
-the devices, and the memory that the compiler reserves is compared with an analytic count.  `--compiler cpu` uses the
-compiler of this machine; `--compiler h200` uses the GPU's, which needs JAX's CUDA plugin but no GPU.  For other meshes,
-and for adapters on a frozen base, memory is counted; `--compiled N` compiles more of them.  To train in this layout,
-run a study with `--distributed --mesh.fsdp 8 --mesh.tensor 2`, in one process per GPU under Slurm, with `grpo.remat`,
-`grpo.bfloat16` and one prompt a micro-batch.
+same step, with the reference and the counterfactual policy, is compiled for sixteen devices, without weights or
+devices, and the memory that the compiler reserves is compared with an analytic count.  `--compiler cpu` uses the
+compiler of this machine; `--compiler h200` uses the GPU compiler, which needs JAX's CUDA plugin but no GPU.  For other
+meshes, and for adapters on a frozen base, memory is only counted; `--compiled N` compiles more of these setups.  To
+train in this layout, run a study with `--distributed --mesh.fsdp 8 --mesh.tensor 2`, in one process per GPU under
+Slurm, with `grpo.remat`, `grpo.bfloat16` and one prompt a micro-batch.
 
 Cost: a minute and a half of one core for each setup that `h200` compiles; `--scale smoke` half a minute.
 
-Expected: 43 of 141 GB on each device, 32 with adapters (`--compiled 2`); some 5 s a step at the assumed shares of peak,
-two thirds of it learning: sampling gathers the sharded weights once, not at every token.  The 32B on 64 devices
-(`--size 32B --meshes 1 8 8`) needs 56 GB on each, 43 with adapters.
+Expected: 43 of 141 GB on each device, 32 with adapters (`--compiled 2`); some 5 s per step at the assumed shares of
+peak, two thirds of it for the update, because sampling gathers the sharded weights once, not at every token.  The 32B
+on 64 devices (`--size 32B --meshes 1 8 8`) needs 56 GB on each, 43 with adapters.
 """
 
 import dataclasses

@@ -1,6 +1,6 @@
-"""Timing of GRPO steps and other workloads: alone in a process, next to variants, over many steps.
+"""Timing of GRPO steps and other workloads: alone in a process, alternating with variants, over many steps.
 
-Reports are made in other modules: importing them would add to the memory of the processes that are measured here.
+Other modules make the reports, because imports add to the measured memory.
 """
 
 import dataclasses

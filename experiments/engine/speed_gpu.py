@@ -11,8 +11,8 @@ The experiment needs a GPU; `--scale smoke` is tiny, runs anywhere, and tests th
 
 Cost: not measured, because no GPU was available; `--scale smoke` under a minute.
 
-Expected: the product reaches 60 to 80 % of the data sheet, flash attention several times the engine's speed; decoding
-is bound by the memory, so that a GRPO step stays below a third of the peak.
+Expected: the product reaches 60 to 80 % of the data sheet's peak; flash attention is several times as fast as the
+engine's; memory bandwidth limits decoding, so a GRPO step reaches less than a third of the peak.
 """
 
 import functools

@@ -1,4 +1,4 @@
-"""Steps of a policy on a Qwen-VL in shapes alone: compiled, and run on drawn weights."""
+"""Training steps of a policy on Qwen-VL: compiled from shapes only, and run on random weights."""
 
 import dataclasses
 import functools

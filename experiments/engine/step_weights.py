@@ -2,14 +2,14 @@
 
     python -m experiments step_weights [--scale smoke] [--size 3B|Qwen3-VL-4B] [--run]
 
-Compiles one step of SFT, end to end through the vision tower, and one of GRPO, both of adapters on frozen weights in
-bfloat16, at a released shape without weights, and reads the memory that the compiler reserves; also with `shallow`
-layers, since loops over stacked layers should compile as fast at any depth.  `--run` also runs both steps with random
-weights in a separate process and measures its largest resident size.
+The experiment compiles one step of SFT, end to end through the vision tower, and one step of GRPO, at a released shape
+without weights; both train adapters on frozen weights in bfloat16.  It reads the memory that the compiler reserves.  It
+also compiles steps of `shallow` layers, because loops over stacked layers should compile as fast at any depth.  `--run`
+also runs both steps with random weights in a separate process and measures its largest resident size.
 
 Cost: two to five minutes of one core for the 3B; with `--run`, 1.5 times the memory of the weights.
 
-Expected: 1.0 to 1.1 times the seconds from 8 to 36 layers; 14 GB for the 3B.
+Expected: 36 layers compile in 1.0 to 1.1 times the seconds of 8 layers; 14 GB for the 3B.
 """
 
 import dataclasses

@@ -2,16 +2,16 @@
 
     make experiment EXP=throughput_feed [ARGS="--scale smoke"]
 
-Measures the CPU time of a batch of SFT or GRPO at `--scale gpu` (one H200) and `--scale paper` (sixteen), read from
-records and from the memory in which the scale stores clips.  Predicts the shortest step of the devices from shapes and
-an assumed share of their peak.  The training loop then runs with these batches and a simulated device that waits for
-the predicted time; the result is the share of the time that the device is idle.  A device has 16 cores; on a machine
+The experiment measures the CPU time of a batch of SFT or GRPO at `--scale gpu` (one H200) and `--scale paper`
+(sixteen), read from records and from clips in memory.  It predicts the shortest step of the devices from shapes and an
+assumed share of their peak.  The training loop then runs with these batches and a simulated device that waits for the
+predicted time; the result is the share of time in which the device is idle.  A device has 16 cores; on a machine
 with fewer cores, its steps are lengthened, at most until the ratio of supply and demand is the same.  The experiment
 needs and measures no accelerator; it does not include the transfer of batches.
 
 Cost: about three minutes on two cores, most of it making the records; `--scale smoke` half a minute.
 
-Expected: below 2 % for either stage at either scale; without threads the GPU would wait for records most of the time.
+Expected: below 2 % for both stages at both scales; without reading threads, the GPU would wait most of the time.
 """
 
 import dataclasses

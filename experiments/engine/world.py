@@ -1,9 +1,9 @@
-"""A small world of touch whose truth is known, and a policy for it small enough to be trained a thousand times.
+"""A simulated world of touch with known truth, and a policy that is small enough to be trained a thousand times.
 
-An object has a hardness and an elasticity, each of three levels.  Two sensors touch it for two time steps: sensor s has
-the evidence z_s = y + σ ε_s of each.  Hardness appears in every step alike; elasticity only in the order of the steps,
-as a ramp that rises (0), stays (1) or falls (2).  A view shows the right level with probability `sight`, else a random
-one.  Answers use the library's language and parser.
+An object has a hardness and an elasticity, each on three levels.  Two sensors touch it for two time steps: sensor s
+observes z_s = y + σ ε_s of each property y.  Both steps show the same hardness; only the order of the steps shows
+elasticity, as a ramp that rises (0), stays (1) or falls (2).  A view shows the right level with probability `sight`,
+otherwise a random one.  Answers use the library's language and parser.
 """
 
 import dataclasses

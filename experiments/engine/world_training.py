@@ -1,7 +1,7 @@
-"""Training and evaluating the policy of the small world by the library's GRPO step, many seeds as one program.
+"""Training and evaluation of the simulated world's policy by the library's GRPO step, many seeds as one program.
 
-A `GrpoVariant` is static: algorithm and rewards.  A `World` and its `Hyperparameters` are traced, so that one compiled
-program serves every value of a knob; `vmap` runs the seeds.
+A `GrpoVariant` (algorithm and rewards) is static.  A `World` and its `Hyperparameters` are traced, so that one compiled
+program serves every value of a parameter; `vmap` runs the seeds.
 """
 
 import dataclasses

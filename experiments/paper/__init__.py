@@ -1,1 +1,1 @@
-"""The paper's tables, ladders and ablations, and released weights."""
+"""The paper's tables and ablations, and training on released weights."""

@@ -2,14 +2,14 @@
 
     make experiment EXP=ablation_consistency [ARGS="--scale smoke"]
 
-Arms of GRPO from one SFT checkpoint per seed and the same questions, with the published ordinal and format rewards:
-without the consistency term, with the published one, and with one that counts only where the answer is right.
+The arms of GRPO share one SFT checkpoint per seed, the questions, and the published ordinal and format rewards.  They
+have no consistency term, the published term, or a gated term that counts only if the answer is right.
 
 Cost: about 25 minutes on two cores with five seeds; `--scale smoke` under two.
 
 Expected: the same level in every slot satisfies the published term, so `echo_share` and the agreement of slots rise.
-The term also makes middle answers rare, since sensors disagree most about middle objects.  The gated term should raise
-the consistency of conclusions (`csc`) without these two effects.
+The published term also makes middle answers rare, because sensors disagree most about middle objects.  The gated term
+should raise the consistency of conclusions (`csc`) without these two effects.
 """
 
 from experiments.study.ablation import Ablation, ablation_experiment

@@ -1,18 +1,18 @@
-"""Does each step of the paper's ablation help what it helps there: ordinal credit OMAE, consistency CSC, SFT most?
+"""Does ordinal credit lower OMAE, the consistency reward raise CSC, and SFT help most, as in the paper's ablation?
 
     make experiment EXP=ablation_cumulative [ARGS="--scale smoke|gpu|paper"]
 
 The arms of Touch-R1's cumulative ablation (arXiv 2605.27154, tables (a) and (b)) are the most frequent levels, SFT,
 GRPO with 0/1 credit, ordinal credit, the consistency reward, the format reward and tactile grounding.  A last arm adds
-the credit for the use of touch, which only the abstract of the paper mentions.  All arms of GRPO start from the SFT
-checkpoint of their seed and see the same questions in the same order.  Each step is compared with the paper's by its
-sign, intervals over seeds and objects, and a p-value over both, corrected for the three primary claims.  Where the
-sign differs, the report lists the known failures of the run.
+the credit for the use of touch, which no equation of the paper contains.  All arms of GRPO start from the SFT
+checkpoint of their seed and see the same questions in the same order.  The report compares each step with the paper's
+by sign, intervals over seeds and objects, and a p-value over both, corrected for the three primary claims.  If the
+sign differs, it lists the known failures of the run.
 
-Cost: some 25 minutes of one core with five seeds after `main_table`, whose policies it shares, 60 without; `--scale
-smoke` under two.
+Cost: with five seeds, some 25 minutes of one core if `main_table` has run, whose policies it shares, otherwise 60;
+`--scale smoke` under two.
 
-Expected: SFT is by far the largest step.  Ordinal credit lowers OMAE by .02 to .05 against 0/1 credit; the consistency
+Expected: SFT is by far the largest step.  Ordinal credit lowers OMAE by .02 to .05 from 0/1 credit; the consistency
 reward makes slots agree and raises CSC little or not at all; format adds nothing after SFT.
 """
 

@@ -2,9 +2,9 @@
 
     make experiment EXP=ablation_format [ARGS="--scale smoke"]
 
-Arms of GRPO from one SFT checkpoint per seed and the same questions: the published reward, the same without the format
-term, half of the weight on format, and the published reward with constrained decoding, under which every rollout is
-formatted.  Evaluation is unconstrained for all arms.  The end of the report gives the seconds of every arm.
+The arms of GRPO share one SFT checkpoint per seed and the questions: the published reward, the same without the format
+term, half of the weight on format, and the published reward with constrained decoding, so that every rollout is
+formatted.  Evaluation is unconstrained for all arms.  The report ends with the seconds of every arm.
 
 Cost: about 35 minutes on two cores with five seeds; `--scale smoke` under two.
 

@@ -2,14 +2,14 @@
 
     make experiment EXP=ablation_grounding [ARGS="--scale smoke"]
 
-Arms of GRPO from one SFT checkpoint per seed, the published reward, the same questions: no grounding, the published
-term at γ = .01, four times that with gradient through both branches, and the bounded form (no gradient through the
-masked branch, 1 nat a token at most) at the same .04.
+The arms of GRPO share one SFT checkpoint per seed, the published reward and the questions: no grounding, the published
+term (gradient through both branches) at γ = .01 and at γ = .04 (`strong`), and the bounded form (no gradient through
+the masked branch, at most 1 nat a token) at γ = .04.
 
 Cost: about 35 minutes on two cores with five seeds; `--scale smoke` under two.
 
-Expected: PAPO (arXiv 2507.06448), where the term comes from, reports that .04 collapses; so `strong` should show a
-growing `grounding` curve and lose accuracy, `strong_bounded` should not, and γ = .01 should change little.
+Expected: PAPO (arXiv 2507.06448), the source of the term, reports collapse at .04; so `strong` should show a growing
+`grounding` curve and lose accuracy, `strong_bounded` should not, and γ = .01 should change little.
 """
 
 from experiments.paper.components import UNGROUNDED

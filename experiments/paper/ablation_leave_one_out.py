@@ -3,13 +3,13 @@
     make experiment EXP=ablation_leave_one_out [ARGS="--scale smoke|gpu|paper"]
 
 The full objective has every component that Touch-R1 names (arXiv 2605.27154): SFT, ordinal accuracy, consistency and
-format rewards, tactile grounding, and the credit for the use of touch of its abstract.  Each component is removed in
-turn: without SFT, GRPO starts from random parameters; without the accuracy reward, only consistency and format earn
-reward; without ordinal credit, 0/1 credit replaces it.  Seeds, questions and their order are the same.  The paper has
-only a cumulative ablation, so each effect is shown with the corresponding step of that ablation.
+format rewards, tactile grounding, and credit for the use of touch.  Each component is removed in turn: without SFT,
+GRPO starts from random parameters; without the accuracy reward, only consistency and format earn reward; 0/1 credit
+replaces ordinal credit.  Seeds, questions and their order are the same.  The paper has only a cumulative ablation, so
+the report shows each effect with the corresponding step of that ablation.
 
-Cost: some 30 minutes of one core with five seeds after `ablation_cumulative`, whose policies it shares, 70 without;
-`--scale smoke` under two.
+Cost: with five seeds, some 30 minutes of one core if `ablation_cumulative` has run, whose policies it shares,
+otherwise 70; `--scale smoke` under two.
 
 Expected: without SFT, every group earns nothing and the policy learns nothing (F7).  Without the accuracy reward, slots
 agree and are wrong (F2).  The effects of the other components are smaller than the differences between seeds.

@@ -6,14 +6,14 @@
 Three arms of GRPO start from the same SFT checkpoint of each seed and see the same questions in the same order; they
 differ only in the reward.  `zero_one` gives 1 for the right level, `ordinal` also 0.4 for a neighbour, both with the
 published consistency term.  `debiased` subtracts from the ordinal credit what a constant answer would earn, so that no
-level is favoured, and rewards consistency only where the answer is right.  All give −0.1 for an answer that cannot be
-parsed.  All are compared with the control that continues SFT for as many seconds (`sft_continued`).
+level is favoured, and rewards consistency only if the answer is right.  All arms give −0.1 for an answer that cannot
+be parsed, and are compared with the control that continues SFT for as many seconds (`sft_continued`).
 
 Cost: about 18 minutes on two cores with five seeds; `--scale smoke` under two.
 
-Expected: ordinal credit favours the middle level, which is near both others (answering the middle earns more than
-answering low if p(low) < p(middle) + 2/3 p(high)), so `ordinal` should give more middle answers than `zero_one`.  A
-lower OMAE that comes only from middle answers is no better use of touch.  `debiased` should reach the same OMAE without
+Expected: ordinal credit favours the middle level, which is next to both others (the answer "middle" earns more than
+"low" if p(low) < p(middle) + 2/3 p(high)), so `ordinal` should give more middle answers than `zero_one`.  If only
+middle answers lower OMAE, the policy does not use touch better.  `debiased` should reach the same OMAE without
 more middle answers.
 """
 

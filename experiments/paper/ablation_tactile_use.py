@@ -2,10 +2,10 @@
 
     make experiment EXP=ablation_tactile_use [ARGS="--scale smoke"]
 
-R_tu rewards answers that score higher with touch than without it.  Arms of GRPO from one SFT checkpoint per seed, the
-published reward, the same questions: no R_tu, the abstract's literal bonus, added to the reward before normalisation,
-and the recommended one, added to the advantage after it.  Each question is also sampled with the touch dropped, with
-noise, and with another object's touch.
+R_tu rewards answers that score higher with touch than without it.  The arms of GRPO share one SFT checkpoint per seed,
+the published reward and the questions: no R_tu; the abstract's literal bonus, added to the reward before
+normalisation; the recommended bonus, added to the advantage after normalisation.  Each question is also sampled
+without touch, with noise, and with another object's touch.
 
 Cost: about 60 minutes on two cores with five seeds (the controls more than double the rollouts); `--scale smoke` two.
 

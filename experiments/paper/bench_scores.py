@@ -1,9 +1,9 @@
-"""The bench's questions, answered from answers about single touches, scored, and compared with the paper's table.
+"""Answers to the bench's questions, computed from answers about single touches; scores beside the paper's table.
 
-A policy has one touch in its prompt.  A property of a touch is asked as it stands; several properties one by one; one
-sensor by that sensor alone.  Touches are compared by the answers about each: by the level, between equal levels by the
-mean of the levels from single sensors; if these are equal too, the touch that is shown first counts as the lesser.  So
-a constant answer has exactly the chance accuracy of a question that comes in all orders.
+A policy has one touch in its prompt.  It answers a question about several properties one by one, and a question about
+one sensor from that sensor alone.  Two touches are compared by the levels that the policy answers for them; if these
+are equal, by the mean level over single sensors; if these are equal too, the touch that is shown first counts as the
+lesser.  Questions come in all orders, so a constant answer has exactly chance accuracy.
 """
 
 import dataclasses

@@ -1,8 +1,8 @@
 """The claims of Touch-R1, and how a recorded run decides each.
 
-A claim is a change between two arms of a run, paired over seeds with Student's interval, or a figure of the run that
-has an interval.  It *holds* where the interval lies on the claimed side, *does not hold* where it lies on the other,
-else it is *undecided*; of several changes all must hold, and none may be reversed.
+A claim is a difference between two arms of a run, paired over seeds with Student's interval, or a figure of the run
+with an interval.  A claim *holds* if the interval lies on the claimed side of 0, *does not hold* if it lies on the
+other side, and is *undecided* otherwise.  A claim of several differences holds only if all of them hold.
 """
 
 import dataclasses
@@ -133,7 +133,7 @@ CLAIMS: tuple[Claim, ...] = (
         text="The consistency reward raises cross-sensor consistency",
         experiment="ablation_cumulative",
         changes=(_ladder("CSC", "consistency", "ordinal", "+ Consistency Reward", "+ Ordinal Reward", csc=True),),
-        why="It rewards equal slots: slots copy each other, and conclusions from single sensors do not change.",
+        why="It rewards equal slots, so slots copy each other; conclusions from single sensors stay the same.",
     ),
     Claim(
         text="The format reward brings a small but stable gain",
@@ -169,14 +169,14 @@ CLAIMS: tuple[Claim, ...] = (
             )
             for i, (metric, title) in enumerate(zip(FOUR, ATTRIBUTES, strict=True))
         ),
-        why="Accuracy on material falls, about which GRPO asks no questions.",
+        why="GRPO asks no questions about material, and accuracy on it falls.",
     ),
     Claim(
         text="Credit for the use of touch helps",
         experiment="ablation_cumulative",
         published="no row",
         changes=(ClaimedChange(name="Avg of four", metrics=FOUR, arm="tactile_use", against="grounding"),),
-        why="The paper mentions it only in the abstract; implemented here as described there.",
+        why="In no equation of the paper; implemented here as its abstract describes.",
     ),
     Claim(
         text="Touch overrules a misleading picture",
@@ -189,7 +189,7 @@ CLAIMS: tuple[Claim, ...] = (
                 "deceptive questions",
             ),
         ),
-        why="On objects that look like another material, policies with touch follow it; others follow the picture.",
+        why="On objects that look like another material, policies with touch follow touch, others the picture.",
     ),
     Claim(
         text="Right answers depend on touch",
@@ -226,7 +226,7 @@ CLAIMS: tuple[Claim, ...] = (
                 spec=".3f",
             ),
         ),
-        why="Prediction is better than copying. The unit of the paper's L1 is unknown, so no comparison is possible.",
+        why="Prediction is better than copying. The paper's L1 has an unknown unit and cannot be compared.",
     ),
     Claim(
         text="Pretraining on future frames captures contact",

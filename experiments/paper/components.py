@@ -1,4 +1,4 @@
-"""The components of Touch-R1's objective: for each the arm that adds it to the ladder and the arm that leaves it out.
+"""The components of Touch-R1's objective: for each, the arm that adds it to the ladder and the arm that omits it.
 
 Every arm of GRPO starts from the SFT checkpoint of its seed and sees the same questions in the same order.
 """
@@ -31,7 +31,7 @@ ZERO_ONE: Weights = {"exact": PUBLISHED["accuracy"], **published_without("accura
 UNGROUNDED = Paper(gamma=0.0)  # GRPO without the grounding term
 
 WITH_TACTILE_USE = Paper(tactile_use=TactileUse.RECOMMENDED)
-"""The published objective with credit for the use of touch, which the paper's abstract names and no equation holds."""
+"""The published objective with credit for the use of touch, which no equation of the paper contains."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +97,7 @@ COMPONENTS: tuple[Component, ...] = (
         omitted=omitted("no_tactile_use", algorithm=Paper()),
     ),
 )
-"""In the order of the paper's ladder; the last is named in its abstract alone."""
+"""In the order of the paper's ladder; no equation contains the last."""
 
 
 def published_steps() -> dict[str, tuple[float, ...] | None]:

@@ -2,19 +2,19 @@
 
     make experiment EXP=conflict [ARGS="--scale smoke|gpu|paper"]
 
-Three of ten generated objects look like a material that differs from theirs in at least two of the levels that are
-typical of it; nothing else in their pictures depends on the object.  A question about one of them is deceptive where
-the picture suggests a wrong answer.  The picture's suggestion to one seed is the majority answer of the policies
-without touch of the other seeds, so that the policy without touch in the table does not decide by its own mistakes
-which questions are deceptive.  The full model (published rewards and grounding) and SFT are compared with the policy
-without touch, and evaluated again under each control of touch: no touch, noise of the sensors' statistics, another
-object's touch, the same touch in another order.
+Three of ten generated objects look like a material whose typical levels differ from those of their own material in at
+least two properties; nothing else in their pictures depends on the object.  A question about such an object is
+deceptive if the picture suggests a wrong answer.  For one seed, the suggestion is the majority answer of the policies
+without touch of the other seeds, so that no policy decides by its own mistakes which questions are deceptive.  The full
+model (published rewards and grounding) and SFT are compared with the policy without touch, and evaluated again under
+each control of touch: no touch, noise of the sensors' statistics, another object's touch, the same frames in another
+order.
 
-Cost: two minutes after `main_table`, whose policies it evaluates, about 27 without; `--scale smoke` under two.
+Cost: two minutes if `main_table` has run, whose policies it evaluates, otherwise about 25; `--scale smoke` under two.
 
-Expected: the policy without touch follows the picture and is right on few deceptive questions, where it disagrees with
-those of other seeds; the full model is right in more than half of them.  Touch adds over 40 points over every control
-except the order of the frames of a press, which contains almost no information.
+Expected: the policy without touch follows the picture and is right on few deceptive questions; the full model is right
+on more than half.  Touch adds over 40 points to every control except the order of the frames of a press, which
+contains almost no information.
 """
 
 import dataclasses

@@ -1,7 +1,7 @@
 """Baselines without a policy, on fixed features of a contact: nearest neighbours and a linear probe.
 
-The features are the recorded fields at the strongest press, the picture of the object, or the encoded touch.  Every
-baseline answers from all streams together and from each alone, as the policies do.
+The features are the recorded fields at the strongest press, the picture of the object, or the encoded touch.  Like
+the policies, every baseline answers from all streams together and from each stream alone.
 """
 
 import dataclasses

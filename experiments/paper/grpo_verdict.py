@@ -2,17 +2,17 @@
 
     make experiment EXP=grpo_verdict
 
-For each seed, all arms start from the same policy, which both phases of SFT have trained.  They train on the same
-encoded contacts and on all properties; half of the questions use only a part of the sensors, and the likelihood of the
-verified answers is a term of the objective.  Arms differ in the conclusion (sampled, or enumerated with its exact
-gradient), in the prompts of a step (8 or 64) and in the algorithm (DAPO, GSPO, CISPO, leave-one-out).  The control
-continues SFT of the decoder for as many seconds.  Learning rates are chosen for each arm on validation objects, with
-the first seed.  All policies are scored once, on objects of another scene seed.
+For each seed, all arms start from the same policy, trained by both phases of SFT.  They train on the same encoded
+contacts and on all properties; half of the questions use only some of the sensors, and the objective includes the
+likelihood of the verified answers (anchor).  Arms differ in the conclusion (sampled, or enumerated with its exact
+gradient), the prompts of a step (8 or 64) and the algorithm (DAPO, GSPO, CISPO, leave-one-out).  The control continues
+SFT of the decoder for as many seconds.  The learning rate of each arm is chosen on validation objects, with the first
+seed.  All policies are scored once, on objects of another scene seed.
 
 Cost: some 80 minutes of one core, a third of it compiling; `--scale smoke` under two minutes.
 
 Expected: with a label for every object, no arm is better than the control in accuracy or error, and most lose one or
-two points on material.  Without an anchor, GRPO lowered the agreement of single sensors most.
+two points on material.  Without an anchor, GRPO loses most in the agreement of single sensors.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""Levels that touch implies without labels: those that sensors agree on, and those that measured physics orders."""
+"""Levels that touch implies without labels: those on which sensors agree, and those that measured physics implies."""
 
 import numpy as np
 from jaxtyping import Float, Int

@@ -10,12 +10,12 @@ contacts by their fields, and linear probes on the encoder of SFT: of its touch,
 object's touch.  Policies and baselines answer about one touch at a time; comparisons are computed from these answers
 (see `experiments.paper.bench_scores`).
 
-Cost: about 25 minutes on two cores with five seeds; the other studies of the bench reuse its policies. `--scale
+Cost: about 25 minutes on two cores with five seeds; the other studies of the bench reuse its policies.  `--scale
 smoke` under two.
 
 Expected: touch adds over thirty points to every baseline without it.  SFT is better than a linear probe on its touch
 and about one point worse than a probe that also reads the picture.  GRPO is no better than SFT that is continued for as
-long.  Baselines without touch are near chance in comparisons.  A constant has an average of about 28.
+long.  Baselines without touch are near chance in comparisons.  A constant has an average of 27 to 29.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""Policies of several sizes: shapes, parameters, times of a step and of an answer, and the trend of their metrics."""
+"""Policies of several sizes: shapes, parameters, times of a step and of an answer, and trends of the metrics."""
 
 import contextlib
 import dataclasses

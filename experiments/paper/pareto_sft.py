@@ -1,13 +1,13 @@
-"""Which phase of training gains most per second: the encoders, the decoder on encoded contacts, or both end to end?
+"""What gains most per second: training the encoders, the decoder on encoded contacts, or both end to end?
 
     make experiment EXP=pareto_sft [ARGS="--scale smoke"]
 
 The encoders are trained with a linear head, or with the decoder end to end, for several numbers of steps.  From each of
 these policies, the decoder alone is trained on schedules of several lengths.  Every policy answers all questions about
-the validation objects, on which the lengths of the studies are chosen; no test object is read.  Seconds exclude
+the validation objects, on which the lengths of the studies are chosen; no test object is used.  Seconds exclude
 compilation.
 
-Cost: 18 minutes of one core with one seed; `--scale smoke` under two minutes.
+Cost: 19 minutes of one core with one seed; `--scale smoke` under two minutes.
 
 Expected: a step with the linear head improves the encoders more than a step end to end, at a quarter of its cost;
 four times as many steps gain some 3 to 4 points, up to 78.8 % after 324 seconds.

@@ -2,13 +2,13 @@
 
     SCALES = {"smoke": SMOKE, "gpu": GPU, "paper": PAPER}, refused on a machine that lacks what `NEEDS` says
 
-`gpu` is sized for one accelerator of 80 GB and an hour or two of training a seed.  `paper` has the sizes that Touch-R1
+`gpu` is sized for one accelerator of 80 GB and one or two hours per seed.  `paper` has the sizes that Touch-R1
 (arXiv 2605.27154) names: 1,000 objects and 14,700 sequences by four sensors, 8 frames of 448², a decoder of
 Qwen2.5-VL 7B's shape, groups of 8, 240,000 questions for SFT and 120,000 for GRPO, three seeds where the paper has one.
 
-Departures of `paper`: towers and decoder start from drawn parameters, since a study loads no released weights, and so
-learning rates are ten times the paper's; answers have the fixed form of `touchr1_jax.text` and 20 tokens; batch sizes
-are ours, the paper gives none.  Neither scale has been run: no machine of that kind was at hand.
+Departures of `paper`: towers and decoder start from random parameters, since a study loads no released weights, so
+learning rates are ten times the paper's; answers have the fixed form of `touchr1_jax.text` and 20 tokens; the paper
+gives no batch sizes, so these are ours.  Neither scale has been run, because no such machine was available.
 """
 
 import dataclasses
@@ -51,7 +51,7 @@ NEEDS: Mapping[str, Accelerators] = {
     "gpu": Accelerators(number=1, memory_gib=70.0),
     "paper": Accelerators(number=16, memory_gib=130.0),
 }
-"""An H100 or H200; sixteen H200, on which `scale_paper` counts 47 to 53 GB of a step on each."""
+"""An H100 or H200; sixteen H200, of which a step needs 43 GB each (`scale_paper`)."""
 
 
 def _study(
@@ -171,7 +171,7 @@ DIFFERENCES: tuple[tuple[str, str, str], ...] = (
     ("questions", "4,800, authored and audited", "all four attributes of every unseen object"),
     ("learning rate", "1e-6 in GRPO, 1e-5 in SFT", "by default the same times 200 falling to 10, and times 100"),
     ("grounding γ, clip", "not given", ".01, .2"),
-    ("tactile use", "in the abstract alone", "an arm of its own, above the paper's last row"),
+    ("tactile use", "in no equation", "an arm of its own, above the paper's last row"),
     ("Avg of the ladder", "equals the mean of its four accuracies", "that mean"),
     ("seeds, intervals", "none", "paired seeds; seeds and objects, corrected over the table"),
 )

@@ -2,13 +2,14 @@
 
     make experiment EXP=qualitative [ARGS="--scale smoke|gpu|paper"]
 
-A browser of rollouts over the bench shows frames, forces, fields at the strongest press, the trace with its parsed
-slots, and each term of the reward.  Next to them are the answers of the same policy without touch, with noise, with
-another object's touch and with the frames in another order, and the answers of SFT and of a policy trained without
-touch.  Rules select cases and items from answers and labels only: the first matches in the order of the data are shown,
-one per object.  A table gives the frequency of each case.
+For answers to the bench's questions, the report shows frames, forces, fields at the strongest press, the trace with its
+parsed slots, and each term of the reward.  It also shows the answers of the same policy without touch, with noise, with
+another object's touch and with the frames in another order, and those of SFT and of a policy trained without touch.
+Rules select cases from answers and labels only: the report shows the first matches in the order of the data, one per
+object.  A table gives the frequency of each case.
 
-Cost: a minute of one core after `main_table`, whose policy it evaluates, seven without; `--scale smoke` under one.
+Cost: a minute of one core if `main_table` has run, whose policy it evaluates, otherwise seven; `--scale smoke` under
+one.
 
 Expected: right answers become wrong with another object's touch.  Where a picture misleads a policy without touch,
 touch corrects about half of the answers (`conflict`), least often those about material.

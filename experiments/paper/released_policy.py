@@ -1,4 +1,4 @@
-"""A run on released weights: that these stay the same, the memory of its training, further evaluations."""
+"""A run on released weights: a check that they stay the same, the memory of training, further evaluations."""
 
 from collections.abc import Mapping
 from pathlib import Path

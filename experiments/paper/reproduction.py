@@ -2,7 +2,7 @@
 
     python -m experiments.paper.reproduction        # REPRODUCTION.md, its figure, and runs/reproduction/report.html
 
-Statements that the paper's own numbers contradict come from `paper_audit`.  A claim without a recorded run is
+`paper_audit` finds the statements that the paper's own numbers contradict.  A claim without a recorded run is
 undecided.  A test compares REPRODUCTION.md with what this module would write.
 """
 
@@ -112,7 +112,7 @@ def recipes(root: Path = ROOT) -> str:
     by_recipe = {recipe: ", ".join(names) for recipe, names in studies.items()}
     return (
         f"SFT is end to end, as published, in {by_recipe['paper'] or 'no run'}; in {by_recipe['touch'] or 'none'} "
-        "the encoders are trained first, with a linear head, and then the decoder, which answers more questions right."
+        "the encoders are trained first, with a linear head, then the decoder; these answer more questions right."
     )
 
 

@@ -1,17 +1,18 @@
-"""What does a larger policy gain: accuracy and OMAE of three sizes against parameters and seconds?
+"""How do accuracy and OMAE of three sizes of policy depend on parameters and seconds?
 
     make experiment EXP=scaling [ARGS="--scale smoke|gpu"]
 
-The same study with a tactile encoder, picture tower and decoder of .43, 1 and 2.1 times the default's parameters, the
-ratios of 3, 7 and 14 billion in the paper's figure.  SFT and GRPO, with the published rewards and grounding, train
+The same study is run with .43, 1 and 2.1 times the default's parameters, about the ratios of 3, 7 and 14 billion in the
+paper's figure.  SFT and GRPO, with the published rewards and grounding, train
 every size on the same scenes, questions and seeds.  The policies, and policies of the same size without touch, answer
 the bench's questions about the test objects.  Learning rates and steps are those of the default size.
 
-Cost: an hour of one core in the recorded run, with three seeds and their data and GRPO shortened to a third; the
-default size's SFT is shared with other experiments; `--scale smoke` under one minute.
+Cost: an hour of one core in the recorded run, with three seeds, and data and GRPO shortened to a third; the default
+size shares its SFT with other experiments; `--scale smoke` under one minute.
 
-Expected: on 2,400 objects some five points from the smallest to the default, and nothing beyond: a probe on
-touch and picture is better than every policy here (`main_table`), so data and decoding, not size, limit the answers.
+Expected: on 2,400 objects, the default gains some five points over the smallest size, and the largest none over the
+default.  A probe on touch and picture is better than every policy (`main_table`), so data and decoding, not size, limit
+the answers.
 """
 
 import dataclasses

@@ -1,8 +1,8 @@
 """A tiny checkpoint in the released format, to try the code without released weights, and how it learns to answer.
 
-Its weights are drawn; `teach` trains all weights of the decoder to write answers, by the step of SFT that trains
-policies, since a released model knows language and nothing of touch.  A prompt names its sensors and shows neither
-touch nor picture, and the levels of an answer are drawn: the form of answers can be learned, the right level cannot.
+Its weights are random.  A released model knows language but not touch; so `teach` trains all weights of the decoder
+to write answers, by the SFT step of the policies.  Prompts name sensors and contain neither touch nor picture, and the
+levels of answers are random: the decoder can learn the form of answers, but not the right level.
 
 `chat_template.jinja` is that of Qwen/Qwen2.5-VL-7B-Instruct, `chat_template_qwen3.jinja` that of
 Qwen/Qwen3-VL-4B-Instruct (Alibaba Cloud, Apache License 2.0), both unchanged.

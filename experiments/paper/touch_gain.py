@@ -1,7 +1,7 @@
-"""Accuracy that a policy gains from touch: its answers under each control of touch, and what they lose.
+"""Accuracy that a policy gains from touch: its answers under each control of touch, and their loss of accuracy.
 
-The controls are those of `touchr1_jax.bench.grounding`: no touch, its frames in another order, noise of the sensors'
-statistics, another object's touch.
+The controls (`touchr1_jax.bench.grounding`) are no touch, the frames in another order, noise of the sensors'
+statistics, and another object's touch.
 """
 
 import dataclasses

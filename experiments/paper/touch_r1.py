@@ -13,15 +13,15 @@ the adapted layers of the decoder, `--lora.vision-targets` those of the vision t
 by rsLoRA, and `--model.four-bits` holds the decoder's frozen kernels in four bits (QLoRA).  The policy is scored on
 unseen objects and compared with the released model, which sees the picture and no touch, with the same training without
 touch, and with constants; it is evaluated again under each control of touch.  The run saves it in `policies/NAME/SEED`,
-with adapters in PEFT's format, and evaluates it again from there.
+with adapters in PEFT's format, and evaluates the saved policy again.
 `python -m experiments ask RUN/touch_r1/0 INPUT` asks it about new data;
 `python -m experiments export RUN/touch_r1/0 FOLDER` merges it into whole weights.
 
 `--scale smoke` makes a tiny checkpoint of the released format if none is given, `smoke_qwen3` one of Qwen3-VL.  Both
-test the code, and their figures mean nothing.  With their random, frozen embeddings, no decoder can give the
-right token a probability above 0.8 %: greedy answers parse, and GRPO samples noise.  `--scale small` first trains such
-a checkpoint to write answers, without touch or pictures, and then trains it on touch: it shows that training works
-without released weights.
+test the code, and their figures mean nothing: with random, frozen embeddings, no decoder can give the right token a
+probability above 0.8 %, so greedy answers parse but GRPO samples noise.  `--scale small` first trains such a checkpoint
+to write answers, without touch or pictures, and then trains it on touch, which tests training without released
+weights.
 
 With `--rollouts.url http://HOST:8000`, a vLLM server with the same weights samples the rollouts of GRPO (README of
 `touchr1_jax`); all stages then number the tokens of a prompt consecutively, as the server does.
@@ -32,13 +32,12 @@ process first reads all weights.
 
 Cost: not measured, because neither such weights nor such a machine were available; sized for the 3B or 7B on one H200,
 where GRPO needs 28 or 52 GB by the count at the start of every run.  `--scale smoke` under two minutes; `--scale
-small` 24 of one core, of which scenes and teaching take 4 each.
+small` 24 to 29 of one core per seed, of which scenes and teaching take 4 each.
 
-Expected: the released model without touch is near the constant, and SFT is much better; GRPO gains what the paper
-reports (`ablation_cumulative`), of which small policies show only a part.  At `small`, the loss of SFT does not fall
-for 500 steps.  Of the ordinal questions about unseen objects, SFT then answers 65 % right, as do GRPO and SFT that
-continues for as long, the checkpoint before training on touch 34 %, the same training without touch 38 %, and a
-constant 34 %.
+Expected: the released model without touch is near the constant, and SFT is much better; the paper reports a further
+gain from GRPO, which small policies lack (`grpo_verdict`).  At `small`, 65 % of the ordinal questions about unseen
+objects are answered right by SFT, by GRPO and by continued SFT; 34 % by the checkpoint before training on touch, 38 %
+by the same training without touch, and 34 % by a constant.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""Descriptions of the videos of a folder and of generated scenes, made once and cached."""
+"""Cached descriptions of the videos of a folder and of generated scenes."""
 
 import dataclasses
 import hashlib

@@ -1,4 +1,4 @@
-"""Tables and charts of the study of real videos, over several partitions of the same objects."""
+"""Tables and charts of `physiclear`, over several partitions of the same objects."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""An ensemble of policies trained on described videos, its answers, and its file."""
+"""An ensemble of policies trained on descriptions of videos, its answers, and its file."""
 
 import dataclasses
 import functools

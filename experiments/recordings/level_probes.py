@@ -1,14 +1,14 @@
 """Level probabilities from a touch: kernel ridge regression on the labels of real objects, read out of fold.
 
-With 60 labelled objects a probe must have few degrees of freedom (`kernel_probe`).  To regress the level itself, as if
-one were half of two, is five points worse.
+With 60 labelled objects, a probe must have few degrees of freedom (`kernel_probe`).  Regression on the level as a
+number, as if level 1 were half of level 2, is five points worse.
 
-The properties of generated scenes are known exactly and cost nothing.  Probes learn them from the same description, and
-their predictions for a real video are the inputs of the probes above.  Lamps, gels and hands differ between the worlds,
-so that only the order of touches within each is used: numbers are standardised each by its own world's mean and
-deviation, or replaced by their ranks.  Hardness is read from standardised numbers, protrusion from ranks, each by the
-levels of scenes alone; roughness from both, by levels and physics.  Predictions are means over scenes drawn with
-several seeds, since which were drawn changes single answers.
+The properties of generated scenes are known exactly and cost nothing.  Probes learn them from descriptions of scenes,
+and their predictions for a real video are the inputs of the probes above.  Lamps, gels and hands differ between scenes
+and real videos, so that only the order of touches within each set is used: numbers are standardised by the mean and
+deviation of their own set, or replaced by their ranks.  Hardness is read from standardised numbers and protrusion from
+ranks, both by probes of levels; roughness from both, by probes of levels and of physical properties.  Predictions are
+means over scenes of several seeds, because the seed changes single answers.
 """
 
 import dataclasses

@@ -5,15 +5,16 @@
 
 PhysiCLeAR (Yu et al., Octopi, RSS 2024): GelSight Mini videos of objects pressed and turned by hand.  People labelled
 hardness, roughness and bumps of 67 objects on three levels.  Ten-fold cross-validation by object on eight partitions;
-intervals over objects.  Settings were chosen on the partitions 101 to 108 of the same objects; ablations and curves use
+intervals over objects.  Settings were chosen on partitions 101 to 108 of the same objects; ablations and curves use
 partition 101.  If the folder contains ratings.json, a target is the mean of the label and of the probability of each
 level given people's ratings of the object (training objects only).  The saved policy learns from all labelled objects.
-`--predict` answers with it, in words with probabilities: each video of a folder separately, several named videos also
-together, as touches of one object.
+With `--predict`, this policy answers for each video of a folder, or for each named video and for all of them together
+as touches of one object, in words with probabilities.
 
-On one core: 5 minutes for scenes, once, 6 minutes for the rest (`smoke` half a minute).  Expected:
-from one video, all three levels right for 45 % of the videos, 73 % of the levels right, OMAE .31; from all videos of an
-object 51 %, 77 % and .26.  People agree with 75 to 79 % of the labels that they rated.
+Cost: 5 minutes of one core to generate scenes, once, and 6 for the rest; `--scale smoke` half a minute.
+
+Expected: from one video, all three levels right for 45 % of the videos, 73 % of the levels right, OMAE .31; from all
+videos of an object 51 %, 77 % and .26.  People's ratings agree with 75 to 79 % of the labels.
 """
 
 import dataclasses

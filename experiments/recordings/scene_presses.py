@@ -1,4 +1,4 @@
-"""Generated presses as a GelSight Mini alone sees them, as they are modelled or with a part of the scene changed."""
+"""Generated presses seen by a GelSight Mini only, as modelled or with one part of the scene changed."""
 
 import dataclasses
 from collections.abc import Callable, Mapping

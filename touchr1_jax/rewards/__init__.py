@@ -1,4 +1,4 @@
-"""The rewards: one file each, and one line each in the dictionary below."""
+"""The rewards: each has one file and one line in the dictionary below."""
 
 from collections.abc import Mapping
 
@@ -71,7 +71,7 @@ STABLE: Mapping[str, str] = {
 
 
 def stable_weights(weights: Mapping[str, float]) -> dict[str, float]:
-    """Weights of an arm under the `stable` algorithm: each reward is replaced as `STABLE` says."""
+    """Weights of an arm under the `stable` algorithm: each reward is replaced according to `STABLE`."""
     found: dict[str, float] = {}
     for name, weight in weights.items():
         found[STABLE.get(name, name)] = found.get(STABLE.get(name, name), 0.0) + weight

@@ -89,7 +89,7 @@ class ExplainAnswer:
     length: int | None = None
     """Tokens before the end token; by default the words of the text."""
     truncated: bool = False
-    """The answer was cut off: no end token came."""
+    """The answer was cut off: it has no end token."""
     longest: int = 20
     """Most tokens of a completion."""
 

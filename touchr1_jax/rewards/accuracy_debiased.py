@@ -41,7 +41,7 @@ def accuracy_debiased(prior: np.ndarray) -> Reward:
 
 
 def uniform_prior(levels: Sequence[int]) -> np.ndarray:
-    """A prior under which every level of an attribute is as likely, float32 [A, K]; `levels` are the K of each."""
+    """A prior under which all levels of an attribute are equally likely, float32 [A, K]; `levels` is K of each."""
     return np.array([[1 / k if level < k else 0.0 for level in range(max(levels))] for k in levels], np.float32)
 
 
@@ -64,12 +64,12 @@ def checked_prior(prior: np.ndarray) -> np.ndarray:
 
 
 def at_level(table: Float[Array, "A K"], level: Int[Array, "A"]) -> Float[Array, "A"]:
-    """Of each attribute the entry at a level; that of level 0 where it is ⊥."""
+    """Entry of each attribute at a level; if the level is ⊥, the entry at level 0."""
     return jnp.take_along_axis(table, jnp.maximum(level, 0)[:, None], axis=1, mode="clip")[:, 0]
 
 
 def constant_earnings(prior: np.ndarray, target: Target) -> tuple[Float[Array, "A K"], Bool[Array, "A K"]]:
-    """Mean credit r̄(k) of the constant answer k, and the mask of levels that an attribute has, both [A, K]."""
+    """Mean credit r̄(k) of the constant answer k, and a mask of the levels of each attribute, both [A, K]."""
     level = jnp.arange(prior.shape[1])
     levels, ordinal = target.levels[:, None, None], target.ordinal[:, None, None]
     table = credit(level[:, None], level, levels, ordinal)  # [A, K answered, K true]

@@ -1,4 +1,4 @@
-"""Debiased accuracy under which an answer that cannot be read earns less than the worst miss."""
+"""Debiased accuracy that gives an unreadable answer less than the worst miss."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,9 +14,9 @@ from touchr1_jax.types import Parsed, Target
 def accuracy_strict(prior: np.ndarray) -> Reward:
     """Make R = R_acc(ŷ, y) − (r̄(ŷ) − mean_k r̄(k)), and −.1 − (max_k r̄(k) − mean_k r̄(k)) for what cannot be read.
 
-    r̄(k) is what the constant answer k earns (see `accuracy_debiased`).  An answer cannot be read where it is not
-    formatted or its conclusion is ⊥; it then earns .1 less than the worst miss, whatever the prior, while under
-    `accuracy_debiased` abstaining beats the miss of a common level.  A departure from the paper.
+    r̄(k) is what the constant answer k earns (see `accuracy_debiased`).  An answer cannot be read if it is not
+    formatted or its conclusion is ⊥; it then earns .1 less than the worst miss under any prior.  Under
+    `accuracy_debiased`, abstaining earns more than missing a common level.  A departure from the paper.
 
     Args:
       prior: float [A, K], as for `accuracy_debiased`.

@@ -1,8 +1,8 @@
-"""Search for answers that earn reward without touch: every short program of slots and layouts, exactly evaluated.
+"""Search for answers that earn reward without touch: all short programs of slots and layouts, evaluated exactly.
 
-A program fills each slot with a constant level, nothing, all levels, or what touch says, and arranges the slots in a
-layout, well or badly.  Its expected reward is a sum over labels and readings of touch.  No program may earn more than
-the honest one, whose slots all hold their own reading.
+A program fills each slot with a constant level, nothing, all levels, or a reading of touch, and arranges the slots in a
+valid or invalid layout.  Its expected reward is a sum over labels and readings of touch.  No program may earn more than
+the honest one, whose slots all contain their own readings.
 """
 
 import dataclasses
@@ -84,7 +84,7 @@ class Earnings:
     prior: Float[np.ndarray, "K"]
 
     def expected(self, accuracy: float = ACCURACY) -> Float[np.ndarray, "N"]:
-        """Expected reward of each program where every reading is right in that share, else any other level alike."""
+        """Expected reward of each program if a reading is right with that probability and otherwise any other level."""
         channel = np.full((K, K), (1 - accuracy) / (K - 1)) + (accuracy - (1 - accuracy) / (K - 1)) * np.eye(K)
         odds = [[self.prior[y] * np.prod(channel[y, list(r)]) for y in range(K)] for r in _readings()]
         return np.einsum("nrk,rk->n", self.table, np.array(odds))
@@ -100,8 +100,8 @@ def earnings(rewards: Mapping[str, AnyReward], weights: Mapping[str, float], pri
     """Reward of every program for every reading and label.
 
     Args:
-      rewards: the choices, by name; those made for a prior must be made for this one.
-      weights: of the rewards that count.
+      rewards: all rewards by name; those that need a prior must be made with this one.
+      weights: of the rewards that are used.
       prior: share of each of the three levels among the labels.
     """
     target = Target(

@@ -50,7 +50,7 @@ class Reward(NamedTuple):
 
 
 class GroupReward(NamedTuple):
-    """A reward of all rollouts of one prompt together, for what a single answer does not show: tokens and the others.
+    """A reward of all rollouts of one prompt together, which sees their tokens and the other rollouts.
 
     Attributes:
       value: (tokens int32 [G, T], parsed answers [G, …], target) → float [G], finite for any G ≥ 1.
@@ -62,10 +62,10 @@ class GroupReward(NamedTuple):
 
 
 class HostReward(NamedTuple):
-    """A reward that Python computes from the text on the host, for what cannot be traced: slower, the device waits.
+    """A reward that Python computes from the text on the host, if it cannot be traced; slower, for the device waits.
 
     Attributes:
-      value: (text, parsed answer, target), all NumPy → one number; pure, for it may be called again.
+      value: (text, parsed answer, target), all NumPy → one number; pure, because it may be called again.
       applies: as in `Reward`, traced.
     """
 
@@ -89,11 +89,11 @@ def total_reward(
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """Weighted sum of the rewards that apply, R = W Σ_n a_n w_n r_n / Σ_n a_n w_n with W = Σ_n w_n.
 
-    Where a term is undefined it is dropped and the other weights grow to the same sum; 0 where no term applies.
+    An undefined term is dropped, and the other weights are scaled up to the same sum; 0 if no term applies.
 
     Args:
-      rewards: the choices, by name.
-      weights: weight ≥ 0 of each reward that counts.
+      rewards: all rewards by name.
+      weights: weight ≥ 0 of each reward that is used.
       parsed: the parsed rollout.
       target: the right answer.
       tokens: the rollout, which a `GroupReward` and a `HostReward` see; the first also needs the axis `GROUP`.

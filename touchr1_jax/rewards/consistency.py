@@ -23,11 +23,11 @@ def agreement(parsed: Parsed, target: Target) -> Float[Array, "A"]:
 def consistency(parsed: Parsed, target: Target) -> Float[Array, ""]:
     """R_cs: mean `agreement` over the asked ordinal attributes (Touch-R1, arXiv 2605.27154, for any number of sensors).
 
-    It rewards the same level in every slot, true or not: a constant answer earns 1.
+    R_cs rewards the same level in every slot, right or wrong: a constant answer earns 1.
     """
     return masked.mean(agreement(parsed, target), target.asked & target.ordinal)
 
 
 def consistency_applies(target: Target) -> Bool[Array, ""]:
-    """R_cs is undefined for one sensor, and for categorical attributes alone."""
+    """R_cs is undefined for one sensor, and if all asked attributes are categorical."""
     return (jnp.sum(target.streams) >= 2) & jnp.any(target.asked & target.ordinal)

@@ -1,4 +1,4 @@
-"""Cross-sensor agreement, paid by how much the answer that it supports beats the prior."""
+"""Cross-sensor agreement, weighted by the correctness of the answer minus its prior probability."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,10 +15,10 @@ def consistency_strict(prior: np.ndarray) -> Reward:
     """Make the mean over asked ordinal attributes of agreement · 1[p_c = ŷ] · (1[ŷ = y] − p(ŷ)).
 
     p_c is the level in `compare`, ŷ the conclusion, p(k) the share of level k among the training labels.  Slots that
-    support another conclusion earn nothing, and a constant answer earns 0 on average: gated by 1[ŷ = y] alone it
-    earns p(ŷ), more than honest reports of touch that is right in 40 %.  Where the conclusion cannot be read, the
-    reward is −max_k p(k), the least that any answer earns.  A departure from the paper; copies of a conclusion that
-    touch supports are still paid.
+    support another conclusion earn nothing, and a constant answer earns 0 on average: with the gate 1[ŷ = y] it
+    earns p(ŷ), more than honest reports of touch that are right in 40 %.  If the conclusion cannot be read, the reward
+    is −max_k p(k), the least of all answers.  A departure from the paper; copies of a conclusion that touch supports
+    still earn the reward.
 
     Args:
       prior: float [A, K], as for `accuracy_debiased`.

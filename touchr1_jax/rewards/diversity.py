@@ -1,4 +1,4 @@
-"""Answers unlike the others of their group."""
+"""Answers that differ from the others of their group."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -9,7 +9,7 @@ from touchr1_jax.types import Parsed, Target
 def diversity(tokens: Int[Array, "G T"], parsed: Parsed, target: Target) -> Float[Array, "G"]:
     """Share of the group's other rollouts with other tokens, 1/(G − 1) Σ_{j≠i} 1[o_j ≠ o_i]; 0 for a lone rollout.
 
-    It pays for any difference, nonsense included: a small weight keeps a group from writing one answer only.
+    The reward pays for any difference, also nonsense; a small weight prevents a group of equal answers.
     """
     del parsed, target
     differs = jnp.any(tokens[:, None] != tokens[None], axis=-1)

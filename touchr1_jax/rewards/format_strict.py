@@ -1,4 +1,4 @@
-"""Format of an answer that answers."""
+"""Format of an answer that concludes."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -7,7 +7,7 @@ from touchr1_jax.types import Parsed, Target
 
 
 def format_strict(parsed: Parsed, target: Target) -> Float[Array, ""]:
-    """1[formatted and every asked attribute is concluded]: an answer that abstains has no format.
+    """1[formatted and every asked attribute is concluded]: an answer that abstains earns 0.
 
     A departure from the paper.
     """

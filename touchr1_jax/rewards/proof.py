@@ -1,4 +1,4 @@
-"""Proof before training that a reward is a finite number for extreme answers and targets."""
+"""A check before training that rewards are finite for extreme answers and targets."""
 
 import dataclasses
 import functools
@@ -21,12 +21,12 @@ def prove_rewards(
 
     Answers: every slot ⊥, lowest or highest, or sensors that disagree; formatted or not, cut off or not, of no, one or
     twenty tokens.  Targets: no attribute asked, one or all; labels unknown, lowest or highest of two, three or nine
-    levels; ordinal or not; no sensor, one, two or all.  A reward on the host is not proved: where it is NaN,
+    levels; ordinal or not; no sensor, one, two or all.  A host reward is not checked: if it is NaN,
     its group is left out.
 
     Args:
       rewards: the choices, by name.
-      names: those to prove.
+      names: those to check.
       sensors, attributes: S and A.
       length: T, tokens of a completion.
 

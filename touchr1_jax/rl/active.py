@@ -1,10 +1,10 @@
-"""GRPO on whole trajectories of touches and an answer: the step of `grpo` with another way to make rollouts.
+"""GRPO on whole trajectories of touches and an answer: the step of `grpo` with other rollouts.
 
     R(τ) = answer − price × seconds − price × harm                                         (`touch_reward`)
 
-Advantages, loss, update and algorithms are those of `grpo`; every token that the policy wrote, touches and answer
-alike, gets the advantage of its trajectory, and observations are no tokens.  The grounding term replaces one
-observation of each trajectory by noise.
+Advantages, loss, update and algorithms are those of `grpo`.  Every token that the policy wrote, of touches and answer,
+gets the advantage of its trajectory; observations are not tokens.  The grounding term replaces one observation of each
+trajectory by noise.
 """
 
 import dataclasses
@@ -162,7 +162,7 @@ class ActiveEngine(GRPOEngine):
     def perturbed(
         self, batch: ActiveBatch, frozen: ActiveInputs, key: Array
     ) -> tuple[Float[Array, "P G B N W"], Int[Array, "P"]]:
-        """Observations of which one of each trajectory is noise at the statistics of the batch's observations."""
+        """Observations with one of each trajectory replaced by noise at the statistics of the batch's observations."""
         del frozen
         seen = cast(Explored, batch.features)
         at_key, noise_key = jax.random.split(key)
@@ -186,9 +186,9 @@ def exploration_metrics(found: Trajectories, batch: ActiveBatch, kinds: tuple[st
 
     `actions` is the mean number of actions, `seconds` and `harm` mean totals; `no_action_share`, `one_action_share` and
     `all_actions_share` are shares of trajectories with none, one and as many actions as allowed; `silent_share` is the
-    share of actions without observation; `first_kind_peak` the share of the most frequent kind among first actions, and
-    `first_kind_information` what the question tells about that kind: their mutual information in the batch, nat;
-    `kinds` the number of kinds, `questions` that of different questions of the batch, `budget` the most actions.
+    share of actions without observation; `first_kind_peak` is the share of the most frequent kind among first actions,
+    and `first_kind_information` the mutual information of question and that kind in the batch, nat; `kinds` and
+    `questions` are the numbers of kinds and of different questions in the batch, `budget` is the most actions.
     """
     acts = found.action >= 0
     number, budget = jnp.sum(acts, -1), acts.shape[-1]
@@ -214,7 +214,7 @@ def exploration_metrics(found: Trajectories, batch: ActiveBatch, kinds: tuple[st
 
 
 def mutual_information(count: Float[Array, "A K"]) -> Float[Array, ""]:
-    """Mutual information Σ p_ak log(p_ak / (p_a p_k)) of two variables that occurred together so often, nat."""
+    """Mutual information Σ p_ak log(p_ak / (p_a p_k)) of two variables from their joint counts, nat."""
     p = count / jnp.maximum(jnp.sum(count), 1.0)
     apart = jnp.sum(p, 0) * jnp.sum(p, 1, keepdims=True)
     return jnp.sum(jnp.where(p > 0, p * jnp.log(jnp.where(p > 0, p, 1.0) / jnp.where(p > 0, apart, 1.0)), 0.0))

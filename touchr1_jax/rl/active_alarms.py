@@ -1,4 +1,4 @@
-"""Alarms of policies that explore: known failures of learning which touch to make, each with its cure.
+"""Alarms of policies that choose touches: known failures, each with a remedy.
 
 The rules and bounds work as those of `alarms`, on the metrics of `active.exploration_metrics`.
 """
@@ -16,19 +16,19 @@ def untouched_share(now: Metrics, start: Metrics) -> float | None:
 
 
 def single_share(now: Metrics, start: Metrics) -> float | None:
-    """Share of trajectories with one action where several are allowed, while answers get no better."""
+    """Share of trajectories with one action although several are allowed, while answers do not improve."""
     several = now["budget"] > 1 and now["accuracy"] <= start["accuracy"]
     return now["one_action_share"] if several else None
 
 
 def full_share(now: Metrics, start: Metrics) -> float | None:
-    """Share of trajectories with as many actions as are allowed, where they are several and have a price."""
+    """Share of trajectories with as many actions as allowed, if several are allowed and have a price."""
     del start
     return now["all_actions_share"] if now["budget"] > 1 and now.get("reward_seconds", 0.0) < 0 else None
 
 
 def question_of_first_kind(now: Metrics, start: Metrics) -> float | None:
-    """Information of the question about the first kind of action, nat, where one of several kinds is half of all."""
+    """Mutual information of question and first kind of action, nat, if one of several kinds is half of all."""
     del start
     differ = now["questions"] > 1 and now["kinds"] > 1 and now["no_action_share"] < 0.5
     return now["first_kind_information"] if differ and now["first_kind_peak"] >= 0.5 else None

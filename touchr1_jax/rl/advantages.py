@@ -23,7 +23,7 @@ def zero_variance(reward: Float[Array, "*p G"]) -> Bool[Array, "*p"]:
 def no_signal(
     algorithm: Algorithm, reward: Float[Array, "P G"], terms: Mapping[str, Float[Array, "P G"]]
 ) -> Bool[Array, "P"]:
-    """Groups in which every advantage is 0, whatever σ is: the rewards that are compared are all equal."""
+    """Groups in which every advantage is 0 for any σ, because the compared rewards are all equal."""
     over_batch = lambda x: jnp.broadcast_to(zero_variance(x.reshape(-1)), x.shape[:1])
     equal = over_batch if algorithm.advantage is Advantage.GLOBAL else zero_variance
     if algorithm.segment_credit or algorithm.advantage is Advantage.PER_REWARD:
@@ -35,11 +35,11 @@ def no_signal(
 
 
 def best_of(reward: Float[Array, "*p G"], k: int) -> Float[Array, "*p G"]:
-    """Mean largest reward of the sets of k rollouts that a rollout is in, max@k; of rewards 0 and 1 it is pass@k.
+    """Mean largest reward over all sets of k rollouts that contain a rollout, max@k; pass@k for rewards 0 and 1.
 
     R̃_i = Σ_{S ∋ i, |S| = k} max_{j∈S} R_j / C(G − 1, k − 1).  The mean over i is the unbiased estimate of max@k (of
-    pass@k: 1 − C(wrong, k)/C(G, k)), and R̃_i less it is the advantage of pass@k training up to its σ (arXiv 2508.10751;
-    for rewards of any size arXiv 2503.19595, 2505.15201).
+    pass@k: 1 − C(wrong, k)/C(G, k)), and R̃_i less it is the advantage of pass@k training up to its σ (arXiv
+    2508.10751; for rewards of any size arXiv 2503.19595, 2505.15201).
 
     Args:
       reward: rewards of groups of G ≥ k rollouts.
@@ -60,17 +60,18 @@ def best_of(reward: Float[Array, "*p G"], k: int) -> Float[Array, "*p G"]:
 def advantages(
     algorithm: Algorithm, reward: Float[Array, "P G"], terms: Mapping[str, Float[Array, "P G"]]
 ) -> Float[Array, "P G"]:
-    """Advantages by the algorithm's comparison, with R̄ and σ those of a group unless a name says otherwise.
+    """Advantages by the algorithm's comparison; R̄ and σ are those of a group unless their name says otherwise.
 
-    GROUP: (R − R̄)/(σ + ε).  BATCH: (R − R̄)/(σ_batch + ε).  NONE: R − R̄ (Dr. GRPO).  LEAVE_ONE_OUT: R_i less the mean of
-    the group's others (RLOO, arXiv 2402.14740).  GLOBAL: (R − R̄_batch)/(σ_batch + ε) (REINFORCE++, arXiv 2501.03262).
-    PER_REWARD: the sum over rewards of their GROUP advantages, in units of its σ over the batch; every reward then
-    counts alike, for σ takes its weight away (GDPO, arXiv 2601.05242, with equal weights).
+    GROUP: (R − R̄)/(σ + ε).  BATCH: (R − R̄)/(σ_batch + ε).  NONE: R − R̄ (Dr. GRPO).  LEAVE_ONE_OUT: R_i less the mean
+    of the group's others (RLOO, arXiv 2402.14740).  GLOBAL: (R − R̄_batch)/(σ_batch + ε) (REINFORCE++, arXiv
+    2501.03262).
+    PER_REWARD: the sum over rewards of their GROUP advantages, in units of its σ over the batch; division by σ removes
+    the weights, so all rewards count equally (GDPO, arXiv 2601.05242, with equal weights).
 
     Args:
       algorithm: which comparison, and ε.
-      reward: total rewards, which count by the best of `algorithm.best_of`.
-      terms: weighted rewards that it is made of.
+      reward: total rewards, compared by the best of `algorithm.best_of`.
+      terms: weighted rewards whose sum it is.
     """
     epsilon, reward = algorithm.epsilon, best_of(reward, algorithm.best_of)
     match algorithm.advantage:
@@ -97,10 +98,10 @@ def advantages(
 def of_kept_groups(
     algorithm: Algorithm, advantage: Float[Array, "P G *t"], finite: Bool[Array, "P"]
 ) -> Float[Array, "P G *t"]:
-    """Advantages as they would be without the groups that are left out, whose own become 0.
+    """Advantages as if the excluded groups did not exist; those of excluded groups become 0.
 
-    Such a group has the mean of all others as its reward (`scoring.left_out_groups`): it leaves the mean of the batch
-    as it is and multiplies σ of the batch by the square root of the share of groups that stay.
+    The reward of an excluded group is the mean of all others (`scoring.left_out_groups`).  It does not change the mean
+    of the batch and multiplies σ of the batch by the square root of the share of groups that stay.
     """
     of_batch = algorithm.advantage in (Advantage.GLOBAL, Advantage.PER_REWARD)
     scale = jnp.sqrt(jnp.mean(finite.astype(jnp.float32))) if of_batch else 1.0
@@ -114,11 +115,11 @@ def segment_advantages(
     settled: Mapping[str, int],
     segment: Int[Array, "P G T"],
 ) -> Float[Array, "P G T"]:
-    """Advantage of each token from the rewards that are not settled before its segment: the return from there on.
+    """Advantage of each token from the rewards that are not known before its segment: the return from there on.
 
-    What is settled before a token does not depend on it, so that leaving it out keeps the policy gradient and takes
-    variance away.  The published agreement of the slots is known at the end of `compare`: the conclusion is then not
-    paid for it.  Each segment's advantages are compared by themselves, as `advantages` does.
+    A reward that is known before a token does not depend on the token, so leaving it out keeps the policy gradient and
+    reduces variance.  The published agreement of the slots is known at the end of `compare`, so the conclusion gets no
+    credit for it.  `advantages` compares each segment separately.
 
     Args:
       algorithm, reward, terms: as for `advantages`.
@@ -138,7 +139,7 @@ def group_advantage(
 ) -> Float[Array, "*p G"]:
     """Advantage within a group, A_i = (R_i − R̄)/(σ_R + ε), population σ (DeepSeekMath, arXiv 2402.03300, eq. 4).
 
-    A group of equal rewards gets exactly 0, where rounding noise over a tiny σ would otherwise give thousands.
+    A group of equal rewards gets exactly 0; otherwise, rounding noise over a tiny σ would give thousands.
 
     Args:
       reward: rewards of the group's rollouts.
@@ -154,10 +155,10 @@ def group_advantage(
 def batch_advantage(reward: Float[Array, "P G"], *, epsilon: float = 1e-4) -> Float[Array, "P G"]:
     """Advantage within a group in units of the whole batch, A_i = (R_i − R̄_group)/(σ_batch + ε).
 
-    σ_batch² is the mean variance of the groups whose rewards differ.  A σ of each group's own weighs questions by how
-    alike their rewards are, which biases a reward that is fair between answers: under ordinal credit debiased by the
-    prior, a group whose label is the middle one spreads half as wide as others, so that over uniform labels and answers
-    "middle" has an advantage of .23 on average and either end one of −.11.  After REINFORCE++ (arXiv 2501.03262), whose
+    σ_batch² is the mean variance of the groups whose rewards differ.  With a σ for each group, questions with similar
+    rewards weigh more, which biases an unbiased reward: under ordinal credit debiased by the prior, rewards of a group
+    with the middle label spread half as wide as those of others, so that over uniform labels and answers, "middle" has
+    an advantage of .23 on average and either end one of −.11.  After REINFORCE++ (arXiv 2501.03262), whose
     mean is the batch's too.
 
     Args:

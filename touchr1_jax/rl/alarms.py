@@ -1,7 +1,7 @@
 """Alarms: known failures of reinforcement from touch, each detected in the metrics of a run by one small function.
 
-A function gets the mean metrics of the last `WINDOW` steps and of the first `START`, those of the policy that training
-starts from, and returns the number that is compared with a bound, or `None`.
+A function gets the mean metrics of the last `WINDOW` steps and of the first `START` steps (the initial policy), and
+returns the number that is compared with a bound, or `None`.
 The codes F1 … F16 number the failures; F11, the collapse of latent prediction, and F14, the prior of the labels, belong
 to other stages.
 """
@@ -99,14 +99,14 @@ def swap_blindness(now: Metrics, start: Metrics) -> float | None:
 
 
 def cancelled_bonus(now: Metrics, start: Metrics) -> float | None:
-    """F5: of the groups whose rollouts earn different bonuses, the share whose advantages are as without them."""
+    """F5: share of the groups with different bonuses in which the bonuses do not change the advantages."""
     del start
     telling = now["bonus_telling_share"]
     return now["bonus_cancelled_share"] / telling if telling > RARE else None
 
 
 def unearned_credit(now: Metrics, start: Metrics) -> float | None:
-    """F6: share of groups with tactile credit, while touch has next to no lead over the best control on average."""
+    """F6: share of groups with tactile credit, while touch is hardly better than the best control on average."""
     del start
     controls = _controls(now)
     if not controls:
@@ -122,10 +122,10 @@ def _controls(now: Metrics) -> dict[str, float]:
 
 
 def idle_groups(now: Metrics, start: Metrics) -> float | None:
-    """F7: share of groups of equal rewards among those that are not all right, while answers get no better.
+    """F7: share of groups of equal rewards among those that are not all right, while answers do not improve.
 
-    A group that is all right has nothing to learn.  Under dynamic sampling these are shares of all candidates, which
-    the log names `drawn_…`: the selected groups hide what was passed over.
+    A group that is all right has nothing to learn.  Under dynamic sampling these are shares of all candidates
+    (`drawn_…` in the log), because the selected groups hide those that were not selected.
     """
     drawn = lambda metrics, name: metrics.get(f"drawn_{name}", metrics[name])
     if drawn(now, "accuracy") > drawn(start, "accuracy"):
@@ -164,13 +164,13 @@ def touched_share(now: Metrics, start: Metrics) -> float | None:
 
 
 def left_out_groups(now: Metrics, start: Metrics) -> float | None:
-    """F15: share of the groups that are left out, for a reward is not finite."""
+    """F15: share of the groups that are left out because a reward is not finite."""
     del start
     return now.get("drawn_nonfinite_share", now.get("nonfinite_share"))
 
 
 def left_out_updates(now: Metrics, start: Metrics) -> float | None:
-    """F15: share of the last `WINDOW` updates that were left out, for a gradient was not finite."""
+    """F15: share of the last `WINDOW` updates that were left out because a gradient was not finite."""
     del start
     return now[LEFT_OUT]
 
@@ -332,11 +332,11 @@ class AlarmMonitor:
         self._left_out: collections.deque[bool] = collections.deque(maxlen=WINDOW)
 
     def update(self, metrics: Metrics, *, left_out: bool = False) -> list[Alarm]:
-        """The alarms after one more step; before the first window is full those that one step raises.
+        """The alarms after one more step; before the first window is full, only those that judge single steps.
 
         Args:
           metrics: of the step; empty where the update was `left_out`, whose metrics may not be finite.
-          left_out: the update was left out, for its gradient was not finite.
+          left_out: the update was left out because its gradient was not finite.
         """
         self._left_out.append(left_out)
         at_once = {**metrics, LEFT_OUT: sum(self._left_out) / WINDOW}

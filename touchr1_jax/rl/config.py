@@ -89,21 +89,21 @@ class Algorithm:
     advantage: Advantage = Advantage.GROUP
     """Mean and σ that a reward is compared with: the group's, one σ for the batch, none, …"""
     best_of: int = 1
-    """Rewards count by the best of k rollouts, pass@k or max@k (see `best_of`); 1 counts each by itself."""
+    """Compare rewards by the best of k rollouts, pass@k or max@k (see `best_of`); 1 compares single rollouts."""
     enumerated: Norm | None = None
-    """Enumerate the level that concludes an answer, rewards over this norm; `None` samples it (see `enumerated`)."""
+    """Enumerate the concluding level, with rewards divided by this norm; `None` samples it (see `enumerated`)."""
     learn_conclusion: bool = True
-    """Learn the level that concludes; False needs `enumerated`, and the level follows the reference (KL, weight 1)."""
+    """Learn the concluding level; False needs `enumerated`, and the level follows the reference (KL, weight 1)."""
     segment_credit: bool = False
-    """Credit a token only with rewards that are not settled before its segment (`advantages.segment_advantages`)."""
+    """Credit a token only with rewards that are not known before its segment (`advantages.segment_advantages`)."""
     stable_rewards: bool = False
-    """Take each published reward in the form that no answer without touch outwits (`rewards.STABLE`)."""
+    """Replace each published reward by a form that no answer without touch exploits (`rewards.STABLE`)."""
     epsilon: float = 1e-4
     """Added to σ, in the units of the reward."""
     drop_degenerate: bool = False
     """Leave groups of equal rewards out of the policy-gradient mean; KL and G_tg keep all."""
     candidates: int = 1
-    """Prompts sampled for each prompt that is learned from; groups of equal rewards are passed over."""
+    """Prompts sampled for each prompt of the update; groups of equal rewards are skipped."""
     mask_truncated: bool = False
     """Leave rollouts without an end token out of the loss; their rewards still count in the group."""
     constrained: bool = False
@@ -114,9 +114,9 @@ class Algorithm:
     kl_in_reward: bool = False
     """Subtract β Σ_t log(π/π_ref) from the reward of a rollout, instead of β KL from the objective."""
     reference_every: int | None = None
-    """Steps after which the policy becomes its own reference; `None` keeps the first one."""
+    """Steps after which the policy becomes its own reference; `None` keeps the first reference."""
     reference_share: float = 1.0
-    """Share of the policy in the reference that it then becomes; below 1 this is a moving average."""
+    """Share of the policy in the new reference; below 1, the reference is a moving average."""
     entropy_weight: float = 0.0
     """Weight of the entropy bonus, per nat."""
     entropy_floor_nat: float | None = None
@@ -135,13 +135,13 @@ class Algorithm:
     tactile_weight: float = 0.3
     """Weight α of the tactile-use reward."""
     tactile_margin: float = 0.1
-    """Lead δ over the best control that is needed for it, in units of accuracy credit."""
+    """Lead δ over the best control that R_tu requires, in units of accuracy credit."""
     controls: int = 4
     """Rollouts of each control."""
     updates: int = 1
     """Updates μ from the same rollouts."""
     minibatches: int = 1
-    """Equal parts of the prompts, from each of which an update takes an optimizer step."""
+    """Equal parts of the prompts; an update takes one optimizer step on each."""
     stale: int = 0
     """Steps by which the sampler's parameters lag behind the learner's."""
     trust_nat: float | None = None
@@ -177,9 +177,9 @@ class Algorithm:
 
 
 def ratio_to_learner(algorithm: Algorithm) -> bool:
-    """True where ratios are to the learner before its first update, false where to the older parameters that sampled.
+    """True if ratios are relative to the learner before its first update, false if to the older sampling parameters.
 
-    Under an importance cap the weights correct for the lag, as in the decoupled objective of AReaL (arXiv 2505.24298).
+    With an importance cap, weights correct for the lag, as in the decoupled objective of AReaL (arXiv 2505.24298).
     """
     return algorithm.stale == 0 or algorithm.importance_cap is not None
 
@@ -190,7 +190,7 @@ def loss_beta(algorithm: Algorithm) -> float:
 
 
 def left_out(weight: float | jax.Array) -> bool:
-    """True for a term that is not computed: its weight is the number 0, and no array that may hold another."""
+    """True for a term that is not computed: its weight is the number 0, not an array that may have another value."""
     return not isinstance(weight, jax.Array) and weight == 0.0
 
 
@@ -203,7 +203,7 @@ class Paper(Algorithm):
 class Stable(Algorithm):
     """Departures that keep the objective bounded: no gradient through the masked branch, G_tg capped at 1 nat a token,
     exact KL, groups of equal rewards left out of the policy-gradient mean, R_tu added after normalisation, and strict
-    rewards in the place of the published ones (`stable_rewards`).
+    rewards instead of the published ones (`stable_rewards`).
 
     Further departures: one σ for all groups, which keeps a debiased reward unbiased; a prompt's grounding adds at most
     a twentieth of a standard deviation of the reward, so that at no γ it outweighs the answer; an entropy bonus up to
@@ -212,9 +212,9 @@ class Stable(Algorithm):
     uninformative, all answers earn the same under a debiased reward, the policy drifts at random until one answer is
     left, and only the reference pulls it back.
 
-    At margin δ = .13 and 4 rollouts of each of three controls, no split of a common distribution over credits 0, .4
-    and 1 earns R_tu in more than 9 % of groups, with two controls in 15 %, with one in 32 % (see `tactile_use`); at
-    the literal δ = .1 a single right answer in eight would pass for touch (18 %).
+    If touch does not help, R_tu is paid in at most 9 % of groups, at margin δ = .13 with 4 rollouts of each of three
+    controls (15 % with two controls, 32 % with one; see `tactile_use`).  At the literal δ = .1, a single right answer
+    in eight would earn it (18 %).
     """
 
     advantage: Advantage = Advantage.BATCH
@@ -280,9 +280,9 @@ class Cispo(Algorithm):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Rloo(Algorithm):
-    """RLOO (arXiv 2402.14740): REINFORCE of whole answers against the mean of the others in the group, without σ.
+    """RLOO (arXiv 2402.14740): REINFORCE on whole answers, with the mean of the group's others as baseline, without σ.
 
-    Its KL in the reward is `beta` with `kl_in_reward`; here there is none.
+    The KL in its reward needs `beta` and `kl_in_reward`; the preset has none.
     """
 
     average: Average = Average.LENGTH
@@ -308,8 +308,8 @@ AnyAlgorithm = Paper | Stable | Dapo | DrGrpo | Gspo | Cispo | Rloo | ReinforceP
 class GRPOConfig:
     """Sizes, learning rate and algorithm of a step.
 
-    `lr_scale` multiplies the paper's learning rate, at which models trained from scratch do not move; the rate falls
-    linearly to `final_share` of itself (not in the paper).
+    `lr_scale` multiplies the paper's learning rate, which is too small for models trained from scratch; the rate falls
+    linearly to `final_share` of its start (not in the paper).
     """
 
     prompts: int = 8
@@ -323,21 +323,21 @@ class GRPOConfig:
     max_grad_norm: float = 1.0
     algorithm: AnyAlgorithm = dataclasses.field(default_factory=Paper)
     temperature: float = 1.0
-    """Logits are divided by it, of the sampler, the learner and the reference alike."""
+    """Divisor of the logits of sampler, learner and reference."""
     top_p: float = 1.0
-    """Sample among the most likely tokens that reach this probability together; the learner renormalises alike."""
+    """Sample from the fewest most likely tokens with this total probability; the learner renormalises alike."""
     min_p: float = 0.0
-    """Sample among tokens of at least this share of the largest probability; the learner renormalises alike."""
+    """Sample from tokens with at least this share of the largest probability; the learner renormalises alike."""
     buckets: tuple[int, ...] = ()
     """Lengths below `length`, ascending: an update computes the shortest that holds its rollouts; each is compiled."""
     inverse_draws: bool = False
-    """Draw tokens by one uniform number per rollout, not one Gumbel number per word: faster, other random bits."""
+    """Draw a token with one uniform number per rollout, not one Gumbel number per word: faster, other random bits."""
     remat: bool = False
     """Keep only matrix products for the backward pass and compute the rest again: less memory, more time."""
     max_logits: int = MAX_LOGITS
     """Logits of a prompt that may exist at once; more tokens are scored in blocks (`models.chunked_logits`)."""
     lean_compilation: bool = False
-    """Compile by XLA's older code generator on CPUs: half of the memory, in half as long again, for slower steps."""
+    """Compile with XLA's older code generator on CPUs: half the memory, 1.5 times as long, slower steps."""
     bfloat16: bool = False
     """Compute forward passes in bfloat16; parameters, softmax, losses and optimizer stay in float32."""
 

@@ -41,11 +41,11 @@ def noise_touch(features: Features, noise: Float[Array, "K S N D"], key: Array) 
 def shuffle_touch(features: Features, key: Array) -> Perturbed:
     """Permute the time steps of every stream, never by the identity; the time ids stay.
 
-    A step is a run of tokens with one frame index.  A stream with fewer than two steps cannot be shuffled, and a prompt
-    of such streams alone is one to which the control does not apply: with all time ids 0 it would test nothing.
-    Departure from R_tu's definition, which permutes frames: here encoded steps change places, because the encoder is
-    frozen in GRPO and contacts are encoded once.  The two are the same for an encoder that reads each step alone; one
-    whose steps attend to each other leaves traces of the order in them, so that this control is the milder one.
+    A step is a run of tokens with one frame index.  A stream with fewer than two steps cannot be shuffled, and the
+    control does not apply to a prompt that has only such streams.  Departure from R_tu's definition, which permutes
+    frames: here encoded steps are permuted, because the encoder is frozen in GRPO and contacts are encoded once.  Both
+    are equal for an encoder that reads each step alone.  If steps attend to each other, they contain traces of the
+    original order, and this control is weaker.
     """
     keys = jax.random.split(key, features.stream_mask.shape)
     source, moved = jax.vmap(jax.vmap(_shuffled_tokens))(features.touch_time, keys)
@@ -56,8 +56,8 @@ def shuffle_touch(features: Features, key: Array) -> Perturbed:
 def swap_touch(features: Features, key: Array) -> Perturbed:
     """Replace touch by that of another prompt of the batch, at a random distance 1 … P − 1; never its own.
 
-    It has all statistics of touch, so that a policy which only detects noise does not pass this control.  Only streams
-    that both prompts have are exchanged.
+    Swapped touch has all statistics of touch, so a policy that only detects noise does not pass this control.  Only
+    streams that both prompts have are exchanged.
     """
     p = features.stream_mask.shape[0]
     other = (jnp.arange(p) + jax.random.randint(key, (), 1, max(p, 2))) % p
@@ -73,7 +73,7 @@ def mask_one_stream(
     """T_mask: replace one present stream of each prompt, uniformly chosen, by an encoded noise draw of its sensor.
 
     Returns:
-      The touch and the index of the replaced stream; a prompt without streams stays as it is.
+      The touch and the index of the replaced stream; a prompt without streams does not change.
     """
     p = features.stream_mask.shape[0]
     stream_key, draw_key = jax.random.split(key)

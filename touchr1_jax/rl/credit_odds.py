@@ -1,7 +1,7 @@
-"""Probability that the recommended R_tu is paid by chance, and where touch helps: exact, by enumeration.
+"""Probability that the recommended R_tu is paid by chance, or if touch helps: exact, by enumeration.
 
-The G rollouts of a group have credits 0, .4 or 1, and so have the J rollouts of each control; every combination of
-counts has its multinomial probability, and `tactile_use.recommended` decides if it is paid.
+The G rollouts of a group and the J rollouts of each control have credits 0, .4 or 1; every combination of counts has a
+multinomial probability, and `tactile_use.recommended` decides whether it is paid.
 """
 
 import functools

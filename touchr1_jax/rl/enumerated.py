@@ -1,6 +1,6 @@
-"""Policy gradient with an enumerated conclusion: traces are sampled, the level that concludes an answer is not.
+"""Policy gradient with an enumerated conclusion: traces are sampled, the concluding level is not.
 
-For trace i of a question, p_ik is the policy's probability of stating level k, r_ik what the answer then earns:
+For trace i of a question, p_ik is the policy's probability of stating level k and r_ik the reward of that answer:
 
     E_i = Σ_k p_ik r_ik,   Ē = mean_i E_i,   J = mean_i E_i / n
 
@@ -46,7 +46,7 @@ class LevelRewards(NamedTuple):
 
 
 class ExactTerms(NamedTuple):
-    """Of every rollout: E_i, the advantage A_i of its trace without gradient, and E_i / n with gradient."""
+    """For every rollout: E_i, the advantage A_i of its trace without gradient, and E_i / n with gradient."""
 
     expected: Float[Array, "*p G"]
     advantage: Float[Array, "*p G"]
@@ -63,10 +63,10 @@ def level_rewards(
 ) -> tuple[LevelRewards, Bool[Array, "P"], dict[str, Float[Array, ""]]]:
     """Rewards of all completions with each level in turn as their conclusion; tokens after it stay as sampled.
 
-    A reward of a group sees the same level in all of its completions: `diversity` pays for traces that differ alone.
+    A group reward sees the same level in all completions: `diversity` pays only for traces that differ.
 
     Args:
-      reward_of: rewards of groups of completions with that level, which their tokens name.
+      reward_of: rewards of groups of completions that conclude with one level, which their tokens contain.
       levels: token of each level, and the one that opens the conclusion.
       tokens: completions.
       target: of the prompts; one that asks for several attributes keeps its sampled rewards.
@@ -74,8 +74,8 @@ def level_rewards(
       finite: prompts whose group counts; the rewards of others are 0.
 
     Returns:
-      The rewards; which prompts count: of those in `finite` the ones that earn a finite reward with every level, also
-      with those that no rollout said; and by `nonfinite_in_levels` the share of the others in all prompts.
+      The rewards; the prompts that count, those of `finite` with a finite reward for every level, also for levels that
+      no rollout stated; and `nonfinite_in_levels`, the share of the other prompts.
     """
     length = tokens.shape[-1]
     ids = jnp.asarray(levels.level, jnp.int32)[jnp.argmax(target.asked, -1)]  # P K
@@ -148,13 +148,13 @@ def _norm(
 def conclude_exactly(
     objective: Float[Array, "*p G T"], concluded: Float[Array, "*p G t"], at: Int[Array, "*p G"]
 ) -> Float[Array, "*p G T"]:
-    """The objective of every token, with another one at the place of the level and nothing after it."""
+    """The objective of every token, replaced at the place of the level and 0 after it."""
     place, at = jnp.arange(objective.shape[-1]), at[..., None]
     return jnp.where(place < at, objective, jnp.where(place == at, concluded, 0.0))
 
 
 def before_level(mask: Bool[Array, "*p G T"], at: Int[Array, "*p G"]) -> Bool[Array, "*p G T"]:
-    """The tokens of the traces among those that exist."""
+    """The existing tokens that belong to the traces."""
     return mask & (jnp.arange(mask.shape[-1]) < at[..., None])
 
 

@@ -3,7 +3,7 @@
     state = environment.reset(case)
     state, outcome = environment.step(state, action)
 
-An environment is a pytree, so that it is an argument of the program and not a constant of it.  Both functions treat one
+An environment is a pytree, so that it is an argument of the program and not a constant in it.  Both functions treat one
 trajectory and are batched by `vmap`.  `TouchBank` is the environment of recorded contacts; any other class with the
 members of `Environment` can take its place.
 """
@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 class Outcome(NamedTuple):
     """Result of one action: N observed tokens, which of them exist, the time that it took and the harm that it did.
 
-    An action that is not available has no token that exists; it takes time all the same.
+    The outcome of an unavailable action has no existing token, but takes time.
     """
 
     tokens: Float[Array, "N W"]
@@ -75,8 +75,8 @@ class TouchCase(NamedTuple):
 class TouchBank:
     """Encoded contacts of O objects, one for each of C choices: N tokens of width W.
 
-    `seconds` is the duration of a contact, also where it is not available; `harm` counts the limits that it strains the
-    gel or the object past; `label` is the level of each attribute, −1 where it is unknown.
+    `seconds` is the duration of a contact, also of an unavailable one; `harm` counts the strain limits, of gel and
+    object, that it exceeds; `label` is the level of each attribute, −1 if it is unknown.
     """
 
     tokens: Float[Array, "O C N W"]
@@ -101,7 +101,7 @@ class TouchBank:
         return case
 
     def step(self, state: TouchCase, action: Int[Array, ""]) -> tuple[TouchCase, Outcome]:
-        """Gather the contact of a choice; one that is not available or not offered returns no token and no harm."""
+        """Gather the contact of a choice; an unavailable or not offered contact returns no token and no harm."""
         at = (state.object, action)
         felt = self.available[at] & state.offered[action]
         tokens = jnp.where(felt, self.tokens[at], 0.0)
@@ -115,7 +115,7 @@ class TouchBank:
 
 
 def check_bank(bank: TouchBank, *, least: int = 2) -> None:
-    """Find the objects and the choices of a bank that leave nothing to choose.
+    """Refuse a bank with objects or choices that leave nothing to choose.
 
     Args:
       bank: contacts.

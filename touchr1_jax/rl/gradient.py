@@ -1,8 +1,8 @@
 """Gradient of the GRPO loss: forward passes of the policies, prompt by prompt, in micro-batches.
 
-Per prompt the policy and the reference each encode their prefix once and pass over the whole group; the perturbed
-policy encodes only what follows the first perturbed token.  Logits exist in one place, `prompt_terms`, and in blocks
-where the vocabulary is large.
+For each prompt, the policy and the reference encode the prefix once and pass over the whole group; the perturbed policy
+encodes only what follows the first perturbed token.  Logits exist only in `prompt_terms`, and in blocks if the
+vocabulary is large.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ GROUNDING, PERTURBED = "grounding_stream_", "perturbed_stream_"
 class Experience(NamedTuple):
     """Rollouts and what an update needs to learn from them; every field has a leading P.
 
-    `old` are the log-probabilities that ratios are taken to after the first of several updates: the learner's before.
+    `old` are the learner's log-probabilities before the first of several updates, to which ratios are relative.
     """
 
     batch: GRPOBatch
@@ -63,16 +63,16 @@ def grpo_gradient(
     Args:
       fns, config: as in `make_grpo_step`.
       params: the learner.
-      reference: the policy that the KL is taken to.
+      reference: the policy from which the KL is measured.
       experience: rollouts with their advantages.
       first: true before the first update from this experience: the learner's own log-probabilities are then the old
-        ones, so that every ratio is 1 whatever precision the sampler computed in.  Where a sampler lags behind and no
-        weights correct for it, ratios are to `experience.old` at every update.
-      longest: `losses.divisor` of the whole batch, where this experience is a part of it.
+        ones, so that every ratio is 1 for any precision of the sampler.  If the sampler lags and no weights correct
+        for it, ratios are relative to `experience.old` at every update.
+      longest: `losses.divisor` of the whole batch, if this experience is a part of it.
 
     Returns:
-      The gradient; the loss and the mean of each of its parts over prompts (of a peak the largest), without those of
-      weight 0, which are not computed; and the log-probabilities that the ratios were taken to.
+      The gradient; the loss and the mean of each of its parts over prompts (of a peak the largest), without parts of
+      weight 0, which are not computed; and the log-probabilities to which the ratios are relative.
     """
     algorithm = config.algorithm
     longest = divisor(config, experience.rollout.mask) if longest is None else longest
@@ -113,14 +113,14 @@ def grpo_gradient(
 def batches_of(size: int, tree: Any) -> Any:
     """Arrays [P, …] cut into [P / size, size, …], neighbours into different batches.
 
-    Where devices share the prompts, neighbours lie on one device, so that each has its part of every batch.
+    If devices share the prompts, neighbours lie on one device, so each device has a part of every batch.
     """
     cut = lambda x: x.reshape(size, x.shape[0] // size, *x.shape[1:])  # not −1: a prompt without a view has 0 tokens
     return jax.tree.map(lambda x: cut(x).swapaxes(0, 1), tree)
 
 
 def in_order(x: Array) -> Array:
-    """An array [P, …] again from its micro-batches."""
+    """Inverse of `batches_of` for one array [P, …]."""
     return x.swapaxes(0, 1).reshape(-1, *x.shape[2:])
 
 
@@ -163,8 +163,8 @@ def prompt_terms(
 ) -> TokenTerms:
     """Terms of every token of one prompt's group, [G, T], with at most `max_logits` logits of each policy at once.
 
-    The reference is not run at β = 0, nor the perturbed policy at γ = 0.  With an anchor, the verified answer is one
-    more completion of the policy's group.
+    At β = 0 the reference is not run, at γ = 0 the perturbed policy is not run.  With an anchor, the verified answer is
+    one more completion of the policy's group.
 
     Raises:
       ValueError: an anchor, and a batch without answers.
@@ -254,8 +254,8 @@ def perturbed_states(
 ) -> Any:
     """Hidden states of the completions under perturbed touch.
 
-    Only what follows the perturbed stream's first token is encoded again: for a single prompt exactly that, for a
-    batch of prompts, whose branches would all be computed, what follows the first stream's.
+    A single prompt is encoded again from the perturbed stream's first token, a batch from the first stream's, because a
+    batch would compute the branches of all streams.
 
     Args:
       prefix: the prompt as the policy encodes it.

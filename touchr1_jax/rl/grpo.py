@@ -71,8 +71,8 @@ LEAN_BEFORE = (0, 11)
 class GRPOState:
     """Everything that a step changes; `key` is the run's root key and the step is folded into it.
 
-    `reference` is there only where the algorithm refreshes it; otherwise that of `FrozenInputs` counts.  `behind` are
-    the parameters before the last `stale` updates, the oldest first, with which the next rollouts are sampled.
+    `reference` exists only if the algorithm refreshes it; otherwise, `FrozenInputs` holds the reference.  `behind` are
+    the parameters before the last `stale` updates, the oldest first; the next rollouts are sampled with the oldest.
     """
 
     params: Params
@@ -86,8 +86,8 @@ class GRPOState:
 class FrozenInputs(NamedTuple):
     """Inputs of a step that a run never changes: the reference policy and encoded noise, K draws of each sensor.
 
-    With the encoder frozen, the encoding of a noise stream does not depend on the prompt, so a bank of K draws stands
-    for fresh noise at every step.
+    The encoder is frozen, so the encoding of noise does not depend on the prompt, and a bank of K draws replaces fresh
+    noise at every step.
     """
 
     reference: Params
@@ -97,7 +97,7 @@ class FrozenInputs(NamedTuple):
 class Group(NamedTuple):
     """The rollouts of D prompts with their rewards; every field has a leading D.
 
-    `finite` is false where a reward was NaN or infinite: the group has no part in the policy gradient.
+    `finite` is false if a reward was NaN or infinite: the policy gradient leaves out the group.
     """
 
     batch: GRPOBatch
@@ -112,7 +112,7 @@ class Group(NamedTuple):
 
 
 def start_state(params: Params, optimizer: optax.GradientTransformation, key: Array, config: GRPOConfig) -> GRPOState:
-    """State before the first step, on buffers of its own, since steps take them over."""
+    """State before the first step, in new buffers, because steps donate their state."""
     copy = lambda: jax.tree.map(jnp.copy, params)
     own = copy()
     return GRPOState(
@@ -126,7 +126,7 @@ def start_state(params: Params, optimizer: optax.GradientTransformation, key: Ar
 
 
 def compiles_leanly() -> bool:
-    """True where this jax still has the code generator that `lean_compilation` asks for."""
+    """True if this jax still has the code generator that `lean_compilation` needs."""
     return jax.__version_info__ < LEAN_BEFORE
 
 
@@ -264,7 +264,7 @@ class GRPOEngine:
         return Group(batch, rollout, parsed, reward, terms, finite, bonus, levels), metrics | left_out
 
     def draw(self, group: int) -> SampleConfig:
-        """Settings of the sampler for so many completions of a prompt."""
+        """Settings of the sampler for groups of this size."""
         return SampleConfig(
             group=group,
             length=self.config.length,
@@ -278,7 +278,7 @@ class GRPOEngine:
         )
 
     def no_signal(self, group: Group) -> Bool[Array, "D"]:
-        """Groups without a gradient: the reward is constant, and the bonus where it is added to the advantage."""
+        """Groups without a gradient: the reward is constant, and so is any bonus added to the advantage."""
         if group.levels is not None:
             return all_equal(group.levels, SPREAD_FLOOR) | ~group.finite
         equal = no_signal(self.config.algorithm, group.reward, group.terms)
@@ -300,7 +300,7 @@ class GRPOEngine:
         return group._replace(reward=reward, terms=terms, finite=finite)
 
     def perturbed(self, batch: Any, frozen: Any, key: Array) -> tuple[Array, Int[Array, "P"]]:
-        """Touch of which one stream of each prompt is noise, for the grounding term, and which stream."""
+        """Touch with one stream of each prompt replaced by noise, for the grounding term, and which stream."""
         return mask_one_stream(batch.features, frozen.noise, key)
 
     def experience(self, group: Group, perturbed: tuple[Array, Int[Array, "P"]]) -> Experience:
@@ -337,7 +337,7 @@ class GRPOEngine:
         )
 
     def refreshed(self, state: GRPOState) -> GRPOState:
-        """The state with a reference that moved to the policy, or by a share of the way, every `reference_every` steps.
+        """The state whose reference moves to the policy, or by a share of the way, every `reference_every` steps.
 
         The moving average of TR-DPO (arXiv 2404.09656), TRL's `ref_model_mixup_alpha`.
         """
@@ -352,7 +352,7 @@ class GRPOEngine:
         return dataclasses.replace(state, reference=jax.tree.map(pick, state.params, state.reference))
 
     def group_metrics(self, group: Group) -> dict[str, Array]:
-        """Metrics of rollouts and rewards: of dynamic sampling those of all candidates and of the selected ones."""
+        """Metrics of rollouts and rewards; with dynamic sampling, of all candidates and of the selected ones."""
         target = group.batch.target
         right = jax.vmap(jax.vmap(tactile_use.right, in_axes=(0, None)))(group.parsed, target)
         return {

@@ -39,15 +39,15 @@ def make_gymnasium_env(
     """A `gymnasium.Env` whose episodes are the prompts of a batch, drawn at random.
 
     Its observation is a dictionary: `question`, the asked attributes; `actions`, how often each action was taken, as a
-    share of the budget; `touch`, the observed tokens [B, N, W], 0 where there is none, or what `encode` makes of them.
-    An action after the last one that is allowed ends the episode without an answer.
+    share of the budget; `touch`, the observed tokens [B, N, W], 0 where there is none, or the result of `encode`.  An
+    action beyond the budget ends the episode without an answer.
 
     Args:
-      environment: what the actions are taken in.
+      environment: the environment of the actions.
       batch: prompts, whose text is ignored.
       budget: most actions of an episode.
       prices, reward: as in training.
-      encode: makes the observation `touch` from what was observed.
+      encode: computes the observation `touch` from the observed tokens.
 
     Raises:
       ImportError: Gymnasium is not installed.
@@ -82,7 +82,7 @@ class Episodes:
     """E episodes at once, on the host; the reward of each comes with its last step.
 
     Attributes:
-      prompts, actions: numbers of prompts, and of actions of the environment and levels.
+      prompts, actions: number of prompts; number of actions and levels.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class Episodes:
     def step(
         self, actions: Int[np.ndarray, "E"]
     ) -> tuple[Observation, Float[np.ndarray, "E"], Bool[np.ndarray, "E"], list[dict[str, Any]]]:
-        """Take an action in every episode: observations, rewards, which end, and totals."""
+        """Take an action in every episode: observations, rewards, which episodes end, and totals."""
         used = (self._taken >= 0).sum(1)
         going = np.flatnonzero((actions < self._kinds) & (used < self._taken.shape[1]))
         self._state, outcome = jax.device_get(self._step(self._state, np.minimum(actions, self._kinds - 1)))

@@ -62,7 +62,7 @@ def grpo_loss(
     levels: LevelRewards | None = None,
     head: Float[Array, "P G T K"] | None = None,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, "P"]]]:
-    """Loss −J of a micro-batch of groups, which adds up to that of the step over all of them.
+    """Loss −J of a micro-batch of groups; the sum over micro-batches is the loss of the step.
 
         J   = Σ_p w_p ⟨c_t S_t⟩ + 1/N Σ_p [ min(γ ⟨G_t⟩, budget) − β ⟨KL_t⟩ + η min(⟨H_t⟩, floor) + λ L_p ]
         S_t = min(ρ_t A, clip(ρ_t, 1 − low, 1 + high) A),   ρ_t = π(o_t) / π_old(o_t)     (`surrogate` has others)
@@ -73,19 +73,19 @@ def grpo_loss(
 
     Args:
       terms: log-probability, reference KL, grounding G and entropy H of every token, [P, G, T].
-      old, sampler: log-probabilities that ratios are taken to, and those that the tokens were drawn with.
+      old, sampler: log-probabilities to which ratios are relative, and those of the sampler.
       mask: which tokens exist.
       advantage: A of each rollout, or of each of its tokens.
       weight: w, the weight of each prompt's policy gradient; 0 leaves the prompt out.
       config: `prompts` is N, `length` the longest completion; `algorithm` holds β, γ, η = `entropy_weight` and bounds.
       longest: `divisor` of the whole batch; by default that of these rollouts.
-      answer: L, the mean log-likelihood of a token of each verified answer; `None` where λ = `anchor` is 0.
-      levels: rewards of every conclusion, where it is enumerated: they replace `advantage` (see `enumerated`).
-      head: log-probabilities of the sampler's most likely tokens, where scores are centered.
+      answer: L, the mean log-likelihood of a token of each verified answer; `None` if λ = `anchor` is 0.
+      levels: rewards of every enumerated conclusion, which replace `advantage` (see `enumerated`).
+      head: log-probabilities of the sampler's most likely tokens, if scores are centered.
 
     Returns:
-      The loss, and per prompt the averages that it is made of, the largest KL and grounding of a token, the share of
-      clipped tokens, and `mismatch_parts` of learner and sampler.
+      The loss, and for each prompt its terms, the largest KL and grounding of a token, the share of clipped tokens, and
+      `mismatch_parts` of learner and sampler.
     """
     algorithm, dropped = config.algorithm, too_far(config.algorithm, old - sampler, mask)
     longest = divisor(config, mask) if longest is None else longest
@@ -121,10 +121,11 @@ def policy_objective(
     levels: LevelRewards | None,
     head: Float[Array, "P G T K"] | None = None,
 ) -> tuple[Float[Array, "P G T"], Bool[Array, "P G T"], dict[str, Float[Array, "P"]]]:
-    """c_t S_t of every token, where the clip cut its gradient off, and each prompt's mean E where it is enumerated.
+    """c_t S_t of every token, where the clip removed its gradient, and each prompt's mean E if it is enumerated.
 
-    With score centering A times `expected_score` is subtracted.  An enumerated conclusion that is not learned is kept:
-    its objective is −KL to the reference, for what the trace learns would move it.  Arguments are those of `grpo_loss`.
+    With score centering, A times `expected_score` is subtracted.  The objective of an enumerated conclusion that is not
+    learned is −KL to the reference, because training the trace would change the conclusion.  Arguments are those of
+    `grpo_loss`.
     """
     exact = None if levels is None else exact_levels(algorithm, terms, levels)
     trace = mask if levels is None else before_level(mask, levels.at)
@@ -165,7 +166,7 @@ def exact_levels(algorithm: Algorithm, terms: TokenTerms, levels: LevelRewards) 
 def importance(
     algorithm: Algorithm, log_ratio: Float[Array, "*n T"], mask: Bool[Array, "*n T"]
 ) -> Float[Array, "*n T"]:
-    """π_old/π_sampler of every token, or, for a whole rollout, their product; the loss cuts them at a cap.
+    """π_old/π_sampler of every token, or their product over a rollout; the loss caps them.
 
     Truncated importance sampling (Yao et al. 2025, "Your efficient RL framework secretly brings you off-policy RL
     training"); TRL's `token_truncate` and `sequence_truncate`.
@@ -179,7 +180,7 @@ def too_far(algorithm: Algorithm, log_ratio: Float[Array, "*n T"], mask: Bool[Ar
     """Rollouts whose mean |log π_old − log π_sampler| of a token is above `mismatch_limit`.
 
     Departure from the geometric mask of a sequence (Liu et al. 2025, "When speed kills stability"; SkyRL), which bounds
-    |mean log π_old / π_sampler|: here tokens that are too likely do not make up for others that are too unlikely.
+    |mean log π_old / π_sampler|: here, tokens that are too likely do not offset tokens that are too unlikely.
     """
     if algorithm.mismatch_limit is None:
         return jnp.zeros(mask.shape[:-1], bool)
@@ -189,7 +190,7 @@ def too_far(algorithm: Algorithm, log_ratio: Float[Array, "*n T"], mask: Bool[Ar
 def mismatch_parts(
     gap: Float[Array, "P G T"], mask: Bool[Array, "P G T"], dropped: Bool[Array, "P G"]
 ) -> dict[str, Float[Array, "P"]]:
-    """Mean and largest |gap| of the drawn tokens of each prompt that count, and its share of dropped rollouts."""
+    """Mean and largest |gap| of the tokens of each prompt that count, and the share of dropped rollouts."""
     return {
         "sampler_gap": masked.mean_of_means(jnp.abs(gap), mask),
         "sampler_gap_peak": jnp.max(jnp.where(mask, jnp.abs(gap), 0.0), (-2, -1)),
@@ -198,7 +199,7 @@ def mismatch_parts(
 
 
 def check_centering(algorithm: Algorithm) -> None:
-    """Refuse what score centering is not defined for: ratios other than 1, conclusions that are not sampled.
+    """Refuse settings without defined score centering: ratios other than 1, conclusions that are not sampled.
 
     Raises:
       ValueError: naming the field.
@@ -220,9 +221,9 @@ def expected_score(
 
         Σ_v sg(q_v w_v − α p_v) log p_v,   w = min(p/q, cap),   α = r min(1/r, cap),   r = (1 − Σ q) / (1 − Σ p)
 
-    Without a cap w is 1 and α = r.  Tokens past the K are taken for r p.  Subtracted from the score of each drawn token
-    it leaves Cov_q(A, w ∇log p) of E_q[A w ∇log p], and takes off the drift of the learner towards a sampler that
-    differs: score centering (Marek & Ryabinin, arXiv 2609.20807, eq. 3 and 7 to 12).
+    Without a cap, w is 1 and α = r.  The other tokens have q ≈ r p.  Subtracting this number from the score of each
+    drawn token leaves Cov_q(A, w ∇log p) of E_q[A w ∇log p] and removes the learner's drift towards a different
+    sampler: score centering (Marek & Ryabinin, arXiv 2609.20807, eq. 3 and 7 to 12).
 
     Args:
       algorithm: its `importance_cap` is the cap.
@@ -251,7 +252,7 @@ def surrogate(
     mask: Bool[Array, "*n T"],
     advantage: Float[Array, "*n"] | Float[Array, "*n T"],
 ) -> tuple[Float[Array, "*n T"], Bool[Array, "*n T"]]:
-    """Clipped policy-gradient objective of every token, to be maximised, and where the clip cut its gradient off.
+    """Clipped policy-gradient objective of every token, to be maximised, and where the clip removed its gradient.
 
     TOKEN: min(ρ_t A, clip(ρ_t, 1 − low, 1 + high) A) with ρ_t = π/π_old (PPO, arXiv 1707.06347, eq. 7; DAPO, arXiv
     2503.14476, sets high above low).  SEQUENCE: the same with one ratio for all tokens, ρ = exp(1/|o| Σ_t log π/π_old),
@@ -261,8 +262,8 @@ def surrogate(
     Args:
       algorithm: kind and clip range.
       log_prob: the learner's log-probabilities of the sampled tokens.
-      old: those of the policy that the ratio is taken to.
-      mask: which tokens exist; the others have values of no meaning.
+      old: those of the policy to which the ratio is relative.
+      mask: which tokens exist; the values of others have no meaning.
       advantage: one number for a whole rollout, or one for each token.
     """
     a = advantage if advantage.ndim == log_prob.ndim else advantage[..., None]
@@ -280,7 +281,7 @@ def surrogate(
 
 
 def divisor(config: GRPOConfig, mask: Bool[Array, "P G T"]) -> int | Float[Array, ""]:
-    """N of `group_mean`: the mean length of the rollouts where tokens are averaged over the batch, otherwise T.
+    """N of `group_mean`: the mean length of the rollouts if tokens are averaged over the batch, otherwise T.
 
     1 for a batch without a token, whose means are 0.
     """
@@ -290,7 +291,7 @@ def divisor(config: GRPOConfig, mask: Bool[Array, "P G T"]) -> int | Float[Array
 
 
 def over_tokens(weight: Float[Array, "P"], mask: Bool[Array, "P G T"]) -> Float[Array, "P"]:
-    """Weights of prompts for the mean over the batch's tokens, which then is that over the prompts that count."""
+    """Weights of prompts such that the mean over the batch's tokens includes only prompts that count."""
     length = jnp.mean(jnp.sum(mask, -1), -1)
     kept = jnp.sum(weight * length)
     return jnp.where(kept > 0, weight * jnp.sum(weight) * jnp.mean(length) / jnp.where(kept > 0, kept, 1.0), 0.0)
@@ -300,16 +301,16 @@ def group_mean(kind: Average, x: Float[Array, "*p G T"], mask: Bool[Array, "*p G
     """Mean over the tokens of each group, [*p].
 
     ROLLOUT: mean_i 1/|o_i| Σ_t x (GRPO).  TOKEN: Σ_i Σ_t x / Σ_i |o_i| (DAPO, arXiv 2503.14476, eq. 8), so that long
-    rollouts weigh more.  LENGTH: mean_i 1/N Σ_t x with the longest length N that is allowed (Dr. GRPO), so that no
-    length is favoured.  BATCH: the same with the mean length of the batch's rollouts as N, so that the mean over the
-    prompts is Σ x over all tokens of the batch by their number, as DAPO's code and TRL compute TOKEN: prompts with long
-    answers weigh more too.
+    rollouts weigh more.  LENGTH: mean_i 1/N Σ_t x with the longest allowed length N (Dr. GRPO), so that no length is
+    favoured.  BATCH: the same with the mean length of the batch's rollouts as N, so that the mean over prompts is the
+    mean of x over all tokens of the batch, as DAPO's code and TRL compute TOKEN: prompts with long answers weigh more
+    too.
 
     Args:
-      kind: which of them.
+      kind: one of these.
       x: value of each token.
       mask: which tokens exist.
-      longest: N, which may differ from the T at hand.
+      longest: N, which may differ from T.
     """
     match kind:
         case Average.ROLLOUT:
@@ -335,8 +336,8 @@ def token_terms(
       algorithm: estimator of the reference KL, bound of the grounding, weights.
       tokens: the sampled ones.
       log_p: log-probabilities under the learner.
-      log_ref: under the reference policy; `None` where β is 0.
-      log_masked: under the learner with one stream of touch replaced by noise; `None` where γ is 0.
+      log_ref: under the reference policy; `None` if β is 0.
+      log_masked: under the learner with one stream of touch replaced by noise; `None` if γ is 0.
     """
     nothing = jnp.zeros(tokens.shape)
     if log_masked is not None and algorithm.grounding_stop_masked:
@@ -391,7 +392,7 @@ def entropy(log_p: Float[Array, "*n V"]) -> Float[Array, "*n"]:
 
 
 def at_most(x: Float[Array, "*n"], bound: float | None) -> Float[Array, "*n"]:
-    """min(x, bound), without gradient where the bound holds; `None` is no bound."""
+    """min(x, bound), without gradient where x exceeds the bound; `None` is no bound."""
     return x if bound is None else jnp.minimum(x, bound)
 
 

@@ -1,8 +1,8 @@
-"""Completions of prompts: a group of samples of each, or the greedy answer, from a shared, once-encoded prefix.
+"""Completions of prompts: a group of samples or the greedy answer, from a shared prefix that is encoded once.
 
 The loop body is one rollout's token step, vmapped over the group (prefix unbatched) and over the prompts (prefix
-batched).  The loop itself is not vmapped: one scalar condition ends it as soon as every rollout has ended, those of all
-runs where whole steps are batched by `vmap`.
+batched).  The loop itself is not vmapped: one scalar condition ends it when every rollout has ended; if whole steps are
+batched by `vmap`, when those of all runs have ended.
 """
 
 import dataclasses
@@ -86,7 +86,7 @@ class SampleConfig:
 def encode_prompts(
     fns: PolicyFns, params: Params, batch: GRPOBatch, known: PrefixCache | None = None, start: int = 0
 ) -> EncodedPrompts:
-    """Prefill each prompt once, or only what follows `start` where `known` holds the rest."""
+    """Prefill each prompt once, or only what follows `start` if `known` holds the rest."""
     prefill = lambda f, i, m, k: fns.prefill(params, f, i, m, k, start)
     return EncodedPrompts(*jax.vmap(prefill)(batch.features, batch.ids, batch.mask, known))
 
@@ -148,7 +148,7 @@ def sample(
 
     Returns:
       A `Rollout` [P, G, T]; after the end token ids are `pad_id`, log-probabilities 0 and the mask false.  Under a
-      constraint the log-probabilities are still those of the unconstrained policy, which is what the learner scores.
+      constraint, log-probabilities are still those of the unconstrained policy, as in the learner.
     """
     return sample_with_caches(decode, first, prefix, empty, key, config)[0]
 
@@ -161,7 +161,7 @@ def sample_with_caches(
     key: Array,
     config: SampleConfig,
 ) -> tuple[Rollout, Any]:
-    """As `sample`, and what the last token step left in the caches [P, G, …], of which any tree will do."""
+    """As `sample`, and the caches [P, G, …], any pytree, after the last token step."""
     p, g, t_max = first.shape[0], config.group, config.length
     step = jax.vmap(jax.vmap(decode, in_axes=(0, None, None, 0)), in_axes=(0, None, 0, 0))
     ends = jnp.asarray(config.end_ids)
@@ -203,8 +203,8 @@ def sample_with_caches(
 def any_alive(alive: Bool[Array, "*runs P G"]) -> Bool[Array, ""]:
     """True while any rollout continues.
 
-    Under `vmap` one condition serves all runs: a condition per run would batch the token index too, and with it every
-    write to a cache.
+    Under `vmap`, one condition serves all runs, because a condition per run would batch the token index and every write
+    to a cache.
     """
     return jnp.any(alive)
 
@@ -228,13 +228,13 @@ def tempered(logits: Float[Array, "*n V"], temperature: float) -> Float[Array, "
 
 
 def truncates(top_p: float, min_p: float) -> bool:
-    """True where some tokens are never drawn."""
+    """True if some tokens are never drawn."""
     return top_p < 1.0 or min_p > 0.0
 
 
 def nucleus(log_p: Float[Array, "*n V"], top_p: float, min_p: float) -> Bool[Array, "*n V"]:
-    """Tokens that may be drawn: of the most likely ones as few as have probability `top_p` together (Holtzman et al.,
-    arXiv 1904.09751), and of those all of at least `min_p` times the largest probability (arXiv 2407.01082).
+    """Tokens that may be drawn: the fewest most likely ones with total probability `top_p` (Holtzman et al., arXiv
+    1904.09751), and of these all with at least `min_p` times the largest probability (arXiv 2407.01082).
     """
     p = jnp.exp(log_p)
     kept = p >= min_p * jnp.max(p, -1, keepdims=True)
@@ -251,7 +251,7 @@ def drawn_log_probs(
 ) -> Float[Array, "*n"]:
     """Log-probability of each drawn token among those that may be drawn, for the sampler and for the learner.
 
-    The learner's nucleus is its own, without gradient, and holds the drawn token; on policy it is the sampler's.
+    The learner computes its own nucleus, without gradient, and adds the drawn token; on policy it equals the sampler's.
     """
     drawn = token_log_probs(log_p, tokens)
     if not truncates(top_p, min_p):
@@ -274,7 +274,7 @@ def draw_token(logits: Float[Array, "P G V"], key: Array, config: SampleConfig) 
 def inverse_draw(logits: Float[Array, "*n V"], uniform: Float[Array, "*n"]) -> Int[Array, "*n"]:
     """Number of words whose cumulative probability does not exceed u: word v with probability softmax(logits)_v.
 
-    The cumulative sum, not 1, is the scale of u, so that rounding never reaches past the last word of any weight.
+    u is scaled by the cumulative sum, not by 1, so that rounding never selects a word of weight 0 at the end.
     """
     weight = jnp.exp(logits - jnp.max(logits, -1, keepdims=True))
     total = jnp.cumsum(weight, -1)

@@ -1,4 +1,4 @@
-"""Reward of one rollout from its tokens, and groups that are left out because of it."""
+"""Reward of one rollout from its tokens, and groups that are left out because of their rewards."""
 
 import dataclasses
 import functools
@@ -23,12 +23,12 @@ ScoreFn = Callable[[Int[Array, "T"], Target], tuple[Float[Array, ""], dict[str, 
 
 
 def reward_weights(algorithm: Algorithm, weights: Mapping[str, float]) -> dict[str, float]:
-    """Weights of the rewards that train by an algorithm: under `stable_rewards` those of their stable forms."""
+    """Weights of the rewards for an algorithm; under `stable_rewards`, the stable forms replace the published ones."""
     return stable_weights(weights) if algorithm.stable_rewards else dict(weights)
 
 
 def require_stable_rewards(score: object) -> None:
-    """Refuse a score that weighs a reward in its published form, which answers without touch outwit.
+    """Refuse a score with a reward in its published form, which answers without touch can exploit.
 
     Raises:
       ValueError: it names the rewards.
@@ -51,12 +51,12 @@ def make_score(
     weights: Mapping[str, float],
     decode: Decode | None = None,
 ) -> "WeightedScore":
-    """Score by weighted rewards (see `rewards.base.total_reward`), each proved finite when the step is traced.
+    """Score by weighted rewards (see `rewards.base.total_reward`), each checked to be finite when the step is traced.
 
     Args:
       parser: in-graph parser.
-      rewards: the choices, by name.
-      weights: of each reward that counts.
+      rewards: all rewards by name.
+      weights: of each reward that is used.
       decode: from tokens to text, for rewards on the host.
 
     Raises (when traced):
@@ -68,7 +68,7 @@ def make_score(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class WeightedScore:
-    """A `ScoreFn` of weighted rewards that also knows when each of them is settled; made by `make_score`."""
+    """A `ScoreFn` of weighted rewards that also states when the value of each is known; made by `make_score`."""
 
     parser: Callable[[Int[Array, "T"]], Parsed]
     rewards: Mapping[str, AnyReward]
@@ -93,7 +93,7 @@ class WeightedScore:
         """`advantages.segment_advantages` of rollouts.
 
         Raises:
-          ValueError: a parser that knows no segments.
+          ValueError: a parser without segments.
         """
         if not isinstance(self.parser, Parser):
             raise ValueError(f"parser is {self.parser!r}: must be a text.parser.Parser to tell segments; use one")
@@ -103,20 +103,19 @@ class WeightedScore:
 
 
 def neutralised(x: Float[Array, "D G"], finite: Bool[Array, "D"]) -> Float[Array, "D G"]:
-    """Numbers of rollouts, those of groups that are not finite replaced by the mean of all others."""
+    """Numbers of rollouts; those of groups that are not finite are replaced by the mean of all others."""
     return jnp.where(finite[:, None], x, masked.mean(x, jnp.broadcast_to(finite[:, None], x.shape)))
 
 
 def left_out_groups(
     reward: Float[Array, "D G"], terms: Mapping[str, Float[Array, "D G"]]
 ) -> tuple[Float[Array, "D G"], dict[str, Float[Array, "D G"]], Bool[Array, "D"], dict[str, Float[Array, ""]]]:
-    """Take groups with a NaN or infinite reward out: theirs becomes the mean of all others, which teaches nothing.
+    """Leave out groups with a NaN or infinite reward: the mean of all others replaces it and gives no gradient.
 
-    So are groups whose rewards have no finite sum of squares: no σ could be told, and all advantages would be 0.
+    Groups whose rewards have no finite sum of squares are left out too: they have no σ, and all advantages would be 0.
 
-    Returns:
-      Reward and terms without such numbers, true for each group that stays, and by `nonfinite_in_TERM` the share of
-      groups in which a term was not finite (`nonfinite_in_total` where every term was, but not their sum or its
+    Returns: Reward and terms without such numbers; true for each group that stays; and `nonfinite_in_TERM`, the share
+      of groups in which a term was not finite (`nonfinite_in_total`: every term was finite, but not their sum or its
       square).
     """
     is_finite = lambda x: jnp.all(jnp.isfinite(x), -1)

@@ -1,4 +1,4 @@
-"""Rollouts that a server draws: what it is asked for, and what is read in its answers.
+"""Rollouts that a server draws: the requests, and how their answers are read.
 
 The protocol is that of vLLM from 0.24 on, POST /v1/completions.  `prompt_embeds` of a request is the embedded prompt,
 in base64 as `torch.save` writes it; an answer holds `token_ids` of each completion and each token's log-probability.
@@ -43,7 +43,7 @@ class RolloutError(RuntimeError):
 
 
 def check_served(config: GRPOConfig) -> None:
-    """Refuse settings of the sampler that a server does not follow.
+    """Refuse settings of the sampler that a server does not support.
 
     Raises:
       ValueError: a temperature other than 1, tokens that are cut off, a constraint, or as `check_centering`.
@@ -70,7 +70,7 @@ def embedded_prompts(
     Args:
       table: of embeddings.
       batch: encoded contacts with questions.
-      slots: where prompts keep their tactile and view tokens.
+      slots: places of tactile and view tokens in prompts.
     """
 
     def one(features: Any, ids: Array, mask: Array) -> tuple[Array, Array]:
@@ -118,7 +118,7 @@ def read_completions(answer: Any, config: GRPOConfig, fns: PolicyFns) -> Rollout
     """The group of completions in an answer to `completion_request`, as arrays [G, T] of the host.
 
     Raises:
-      RolloutError: naming the field that is missing or cannot be.
+      RolloutError: naming the field that is missing or invalid.
     """
     choices = answer.get("choices") if isinstance(answer, dict) else None
     group, length, most = config.group, config.length, config.algorithm.score_centering

@@ -20,7 +20,7 @@ ROUNDING_NAT = 1e-7
 def stream_influence(
     fns: PolicyFns, params: Params, batch: GRPOBatch, noise: Float[Array, "K S N D"], key: Array, length: int
 ) -> tuple[Float[Array, "S"], Bool[Array, "S"]]:
-    """Change of sampled answers by noise in each stream alone, and the streams that any prompt has.
+    """Change of sampled answers by noise in each single stream, and the streams that any prompt has.
 
     KL(π(· | touch) ‖ π(· | stream s made noise)), mean over the tokens of one answer a prompt and over the prompts that
     have the stream, nat.

@@ -1,13 +1,13 @@
-"""R_tu, the reward for answers that the policy does not reach without touch.
+"""R_tu, the reward for answers that are better than those of the policy without touch.
 
 With s = max(R_acc, 0) and, for each control c of the touch, the mean s̄^c of its own rollouts: b = max_c s̄^c.
   Literal:      m_i = 1[s̄ > b + δ] · 1[d_i = 0], added to the reward (Touch-R1, arXiv 2605.27154, abstract).
   Recommended:  m_i = 1[s̄ > b + δ] · 1[formatted_i] · max(0, s_i − b), added to the advantage.
 Both are 0 where nothing is right, and the recommended one does not cancel when all right rollouts earn it.
 
-b is the largest of the controls that apply, so that fewer controls let more chance through: at δ = .13, in groups of 8
-with 4 rollouts a control, a group without any lead is paid in up to 9 % of cases with three controls, in 15 % with two,
-in 32 % with one (`credit_odds.false_credit`).  `control_missing_share` logs how many do not apply.
+b is the largest mean of the controls that apply, so R_tu is paid by chance more often with fewer controls: at δ = .13,
+in groups of 8 with 4 rollouts per control, if touch does not help, in up to 9 % of groups with three controls, 15 %
+with two and 32 % with one (`credit_odds.false_credit`).  `control_missing_share` logs the share that does not apply.
 """
 
 from collections.abc import Callable, Mapping
@@ -80,8 +80,9 @@ def controls(
 ) -> tuple[Perturbed, Perturbed, Perturbed]:
     """Touch under R_tu's three controls: dropped, replaced by noise, and out of order.
 
-    Literal: order is a shuffle, which counts where the question is marked as depending on order.  Recommended: other
-    questions get another object's touch instead, so that a policy which only detects noise does not pass.
+    Literal: the third control is a shuffle, which applies if the question is marked as depending on order.
+    Recommended: other questions get another object's touch instead, so that a policy that only detects noise does not
+    pass.
     """
     features = batch.features
     depends = jnp.zeros(features.stream_mask.shape[0], bool) if batch.ordered is None else batch.ordered
@@ -103,7 +104,7 @@ def bonus_metrics(
     bonus: Float[Array, "P G"],
     advantage: Float[Array, "P G"],
 ) -> dict[str, Array]:
-    """Share of groups whose rollouts earn different bonuses, and of those among them whose advantages ignore it."""
+    """Share of groups with different bonuses, and of those among them whose advantages ignore the bonuses."""
     if algorithm.tactile_use is TactileUse.LITERAL:
         reward = reward - terms[TERM]
         terms = {name: term for name, term in terms.items() if name != TERM}
@@ -118,16 +119,16 @@ def score(parsed: Parsed, target: Target) -> Float[Array, ""]:
 
 
 def right(parsed: Parsed, target: Target) -> Bool[Array, ""]:
-    """d = 0: every asked attribute is answered right; an unknown label (−1) is matched by no answer."""
+    """d = 0: every asked attribute is answered right; no answer matches an unknown label (−1)."""
     return jnp.all(((parsed.conclude == target.label) & (target.label >= 0)) | ~target.asked)
 
 
 def bar(control: Float[Array, "C J"], counts: Bool[Array, "C"]) -> Float[Array, ""]:
-    """b = max_c mean_j s_j^c over the controls that count; 1, which nothing passes, where none does.
+    """b = max_c mean_j s_j^c over the controls that apply; if none applies, 1, which no reward exceeds.
 
     Args:
       control: s of the rollouts under each control.
-      counts: controls that apply to this prompt, as a shuffle does where order matters.
+      counts: controls that apply to this prompt; a shuffle applies if order matters.
     """
     return masked.maximum(jnp.mean(control, -1), counts, empty=1.0)
 

@@ -1,4 +1,4 @@
-"""The reward of a trajectory: its answer, less the price of the time that it took and of the harm that it did."""
+"""The reward of a trajectory: that of its answer minus the price of its time and of its harm."""
 
 import itertools
 from collections.abc import Callable
@@ -44,7 +44,7 @@ def priced_answer(parsed: Parsed, target: Target, spent: Spent, prices: Prices) 
 
 
 def check_touch_reward(reward: TouchReward, prices: Prices, target: Target, outcome: Outcome, budget: int = 1) -> None:
-    """Compute the reward of every constant answer and of none: before any action, after each, after several slow ones.
+    """Compute the rewards of all constant answers and of no answer: before any action, after each, after slow ones.
 
     Args:
       reward, prices: those of training.
@@ -69,7 +69,7 @@ def check_touching_pays(reward: TouchReward, prices: Prices, target: Target, out
     """Compare the right answer after the cheapest action with the best constant answer before any.
 
     Args:
-      reward, prices, target, outcome: as in `check_touch_reward`, of prompts enough to say which constant is best.
+      reward, prices, target, outcome: as in `check_touch_reward`, with enough prompts to find the best constant.
 
     Raises:
       RewardError: no question for which the right answer earns more, so that a policy can only learn not to touch.

@@ -1,4 +1,4 @@
-"""Trajectories of a policy that explores: its turns and what it observes, in one program.
+"""Trajectories of a policy that explores: its turns and observations, in one program.
 
 Each of B + 1 turns is decoded token by token until it is complete; an action is then taken in the environment, and its
 observation is appended to the keys and values of the trajectory.  The last turn must conclude.  A turn that is
@@ -33,8 +33,8 @@ class ActiveBatch(GRPOBatch):
 class Trajectories:
     """G trajectories of each of P prompts, of at most B actions; T are the tokens of B + 1 turns.
 
-    `action` is −1 where none was taken.  `seconds` and `harm` are totals.  Of `parsed`, `conclude` is the answer,
-    `formatted` means that there is one, and `truncated` that there is none.
+    `action` is −1 where none was taken.  `seconds` and `harm` are totals.  In `parsed`, `conclude` is the answer,
+    `formatted` means that there is an answer, and `truncated` that there is none.
     """
 
     rollout: Rollout
@@ -95,7 +95,7 @@ def sample_trajectories(
 
     Args:
       fns, params: the policy.
-      environment: what the actions are taken in.
+      environment: the environment of the actions.
       batch: prompts.
       key: randomness; token t of turn i uses `fold_in(fold_in(key, i), t)`.
       draw: size of a group, and how tokens are drawn; its length and constraint are those of `fns`.

@@ -21,25 +21,25 @@ MOST = 4
 def within_trust(
     fns: PolicyFns, config: GRPOConfig, before: Params, after: Params, learn: Experience, delta: float
 ) -> tuple[Params, dict[str, Array]]:
-    """Shorten an update until it moves the policy by about δ nat a token at most, on the rollouts that it is from.
+    """Shorten an update until it changes the policy by at most about δ nat a token, on the rollouts of the update.
 
-    θ = θ₀ + s (θ₁ − θ₀), from s = 1 on by s ← s √(δ / KL(π₀ ‖ π_s)) while KL(π₀ ‖ π_s) > 1.5 δ, four times at most: KL
-    is quadratic in a small step, so that one shortening is enough for a step that is slightly too long, but not for a
-    much longer one, where KL grows more slowly.  Where the KL is not finite, s is halved, and an update that still has
-    none is left out, s = 0.  An update that is short enough is measured once.  The KL is the k3
-    estimate on the rollouts, with `learn.old` as log π₀.  The scaling of the trust-region step (TRPO, arXiv 1502.05477,
-    appendix C), here of any optimizer's, with this fixed point for its line search.
+    θ = θ₀ + s (θ₁ − θ₀), starting at s = 1, with s ← s √(δ / KL(π₀ ‖ π_s)) while KL(π₀ ‖ π_s) > 1.5 δ, at most four
+    times: KL is quadratic in a small step, so one shortening is enough for a step that is slightly too long, but not
+    for a much longer one, where KL grows more slowly.  If the KL is not finite, s is halved; if it stays so,
+    the update is left out, s = 0.  A short update is measured once.  The KL is the k3 estimate on the rollouts, with
+    `learn.old` as log π₀.  This applies the scaling of the trust-region step (TRPO, arXiv 1502.05477, appendix C) to
+    any optimizer, with this fixed point instead of a line search.
 
     Args:
       fns, config: as in `make_grpo_step`.
       before: parameters θ₀.
       after: parameters θ₁ that the optimizer proposes.
-      learn: the rollouts, and the log-probabilities `old` that the KL is taken to.
-      delta: δ; with several updates from the same rollouts it bounds all of them together, since the KL is that to the
-        policy before the first.
+      learn: the rollouts, and the log-probabilities `old` from which the KL is measured.
+      delta: δ; it bounds several updates from the same rollouts together, since the KL is measured from the policy
+        before the first.
 
     Returns:
-      The parameters θ, and `update_kl`, the KL that was proposed, and `update_scale`, s.
+      The parameters θ; `update_kl`, the KL of the proposed update; and `update_scale`, s.
     """
     # by selection: 0 times what is not finite is not 0
     between = lambda scale: jax.tree.map(lambda a, b: jnp.where(scale > 0, a + scale * (b - a), a), before, after)

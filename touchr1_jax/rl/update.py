@@ -30,13 +30,13 @@ def update_policy(
     reference: Params,
     learn: Experience,
 ) -> tuple[Params, optax.OptState, dict[str, Array]]:
-    """μ passes over the same rollouts, each of one optimizer step for every minibatch.
+    """Make μ passes over the same rollouts, each with one optimizer step per minibatch.
 
-    Ratios are to the learner before the first step.  With minibatches that takes a forward pass of its own; their
-    gradients at the same parameters have that of the whole batch as their mean.
+    Ratios are relative to the learner before the first step, which needs an extra forward pass with minibatches.  At
+    the same parameters, the mean of the minibatches' gradients is the gradient of the whole batch.
 
     Returns:
-      Parameters, state of the optimizer, and parts of the first pass, but `clip_share` of the last one.
+      Parameters, state of the optimizer, and parts of the first pass, with `clip_share` of the last.
     """
     algorithm, longest = config.algorithm, divisor(config, learn.rollout.mask)
     number, count = algorithm.minibatches, algorithm.updates
@@ -78,7 +78,7 @@ def update_policy(
 
 
 def over_minibatches(parts: dict[str, Float[Array, "n"]]) -> dict[str, Float[Array, ""]]:
-    """Metrics of all minibatches from those of each: the largest peak, sums of counts, means of all others.
+    """Metrics over all minibatches: the largest peak, sums of counts, means of all others.
 
     The grounding of a stream is weighted by the number of prompts in which it was perturbed.
     """
@@ -98,10 +98,10 @@ def finite_update(
     opt_state: optax.OptState,
     params: Params,
 ) -> tuple[Params, optax.OptState]:
-    """Parameters and optimizer state after a gradient; as before where its norm is NaN or infinite.
+    """Parameters and optimizer state after a gradient; unchanged if its norm is NaN or infinite.
 
-    An optimizer of `skipping.skip_nonfinite` sees to that itself and counts; any other receives zeros instead of such a
-    gradient, and what it answers is discarded.
+    An optimizer of `skipping.skip_nonfinite` handles and counts such gradients itself; any other receives zeros
+    instead, and its result is discarded.
     """
     if isinstance(opt_state, Skipping):
         updates, opt_state = optimizer.update(grads, opt_state, params)
@@ -121,7 +121,7 @@ def bucketed_gradient(
     first: bool | Bool[Array, ""] = True,
     longest: int | Float[Array, ""] | None = None,
 ) -> Gradient:
-    """`grpo_gradient` over as many tokens as the shortest bucket has that holds rollouts, levels and answers."""
+    """`grpo_gradient` over the tokens of the shortest bucket that holds rollouts, levels and answers."""
     lengths = (*config.buckets, config.length)
 
     def over(length: int) -> Callable[[Params], Gradient]:

@@ -1,8 +1,7 @@
 """Checkpoints by Orbax: state, data iterator and step together, published atomically; the newest N and the best kept.
 
 Every file of a checkpoint is compared with its checksum before it is read, and every array with its digest afterwards,
-for a flipped bit on a disk raises no error of its own.  A damaged checkpoint is set aside, and an older one takes its
-place.
+because a flipped bit on a disk raises no error.  A damaged checkpoint is set aside, and an older one is used.
 """
 
 import contextlib
@@ -52,11 +51,11 @@ class CheckpointError(ValueError):
 
 
 class DamagedCheckpointError(CheckpointError):
-    """Files that are not what was saved."""
+    """Files that differ from what was saved."""
 
 
 class Restored(NamedTuple):
-    """Contents of a checkpoint, and step and score of the best one up to then."""
+    """Contents of a checkpoint, and step and score of the best checkpoint so far."""
 
     step: int
     state: Any
@@ -79,13 +78,13 @@ def _complain(text: str) -> None:
 class Checkpoints:
     """The checkpoints of one stage; a context manager that waits for the last save.
 
-    What a killed process left half-written is removed.
+    Half-written files of a killed process are removed.
 
     Args:
-      directory: where they lie; created if need be.
+      directory: their folder; created if necessary.
       keep: how many of the newest stay.
-      better: which held-out scores are better, to keep the best scored checkpoint too; `None` where none has a score.
-      print_: receives a line about each damaged checkpoint that is passed over; standard error by default.
+      better: which held-out scores are better, to keep the best checkpoint too; `None` if checkpoints have no score.
+      print_: receives a line about each damaged checkpoint that is skipped; standard error by default.
 
     Raises:
       CheckpointError: the directory cannot be read or written.
@@ -139,14 +138,14 @@ class Checkpoints:
     def save(self, step: int, state: Any, data: Any, score: float | None = None) -> None:
         """Save a pytree of arrays and a JSON value as checkpoint `step`; writing goes on in the background.
 
-        The arrays are copied first: the writer must not read buffers that the next step takes over by donation.  Where
-        several threads train, a save is complete when this returns.
+        The arrays are copied first, because the next step overwrites donated buffers.  If several threads train, the
+        save is complete when this returns.
 
         Args:
           step: its number.
           state: arrays.
           data: any JSON value.
-          score: held-out score; only where `better` is set.
+          score: held-out score; only if `better` is set.
 
         Raises:
           CheckpointError: this checkpoint does not fit on the disk, or the one before it did not reach it.
@@ -178,10 +177,10 @@ class Checkpoints:
         return self._manager.latest_step()
 
     def restore(self, like: Any) -> Restored | None:
-        """The newest intact checkpoint in the shapes, dtypes and placement of `like`, or `None` where there is none.
+        """The newest intact checkpoint in the shapes, dtypes and placement of `like`, or `None` if there is none.
 
-        Damaged ones are renamed to `damaged-STEP` and reported.  That the best before it is lost is reported too: it
-        matters only if no later one is as good.
+        Damaged checkpoints are renamed to `damaged-STEP` and reported.  A lost best checkpoint is reported too; the
+        loss matters only if no later one is as good.
 
         Raises:
           CheckpointError: it holds another tree or other shapes.
@@ -207,7 +206,7 @@ class Checkpoints:
         return None
 
     def best(self, like: Any) -> Restored | None:
-        """The checkpoint of the best score, or `None` where none has a score.
+        """The checkpoint with the best score, or `None` if none has a score.
 
         Raises:
           CheckpointError: it is damaged, or holds another tree or other shapes.
@@ -325,8 +324,8 @@ class Checkpoints:
 def digest(state: Any) -> UInt32[Array, "n"]:
     """One number for each array of a pytree, Σ_i w_i b_i mod 2³² with bits b_i and odd weights w_i of their places.
 
-    A changed element always changes it: an odd weight has an inverse.  Sums of integers come out the same in any order,
-    so that it does not depend on how, or on how many devices, the arrays lie.
+    A changed element always changes the digest, because an odd weight has an inverse.  Integer sums are equal in any
+    order, so the digest does not depend on the placement of the arrays on devices.
 
     Args:
       state: arrays, PRNG keys among them, of any shape.
@@ -366,8 +365,8 @@ def _file_checksums(where: Path, inside: str = "") -> dict[str, int]:
 
 
 def changed_files(where: Path, inside: str = "") -> list[str]:
-    """Files of a checkpoint, or of a folder inside of it, that are not what was saved; none where it has no checksums,
-    as those of earlier versions.
+    """Files of a checkpoint, or of a folder in it, that differ from what was saved; none if it has no checksums, as
+    in earlier versions.
     """
     path = where / CHECKSUMS
     if not path.is_file():

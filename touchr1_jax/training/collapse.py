@@ -1,4 +1,4 @@
-"""Small encoders driven into collapse, many seeds at once, with the measurements that raise the alarms."""
+"""Small encoders that are made to collapse, many seeds at once, and the measurements that raise alarms."""
 
 from collections.abc import Callable
 
@@ -45,7 +45,7 @@ class CollapseRun:
     Args:
       untrained, blocks: measurements on the watched contacts, before training and after every block of steps.
       start, end: measurements on the test contacts, before and after training.
-      before, after: features of all contacts but the watched ones.
+      before, after: features of all contacts except the watched ones.
     """
 
     untrained: LatentMeasures
@@ -74,7 +74,7 @@ def make_runner(
     Args:
       config: networks.
       contacts: all contacts, in memory.
-      train: those that are trained on; the others are the test contacts.
+      train: contacts for training; the others are the test contacts.
       watched: contacts of other objects, for the alarms during training.
       batch_size: contacts of a step, drawn with replacement.
       blocks, block_steps: number of measurements, and steps between them.

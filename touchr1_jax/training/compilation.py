@@ -1,4 +1,4 @@
-"""Compiled programs that outlive the process, and quick compilation of programs that run a few times."""
+"""A disk cache of compiled programs, and quick compilation of programs that run only a few times."""
 
 import contextlib
 import ctypes
@@ -35,13 +35,13 @@ MAPPINGS_SHARE = 0.5
 
 @contextlib.contextmanager
 def compilations_kept(directory: Path, least_s: float = WORTH_KEEPING_S) -> Iterator[None]:
-    """Let XLA read and write programs that took `least_s` or longer to compile, inside the block, in a directory.
+    """Inside the block, let XLA cache programs that took `least_s` or longer to compile in a directory.
 
-    A program is found again by its code, its shapes and the versions of the compiler.  Programs of another kind of
-    processor lie in another folder, for they may hold instructions that this one lacks, so that all machines may share
-    the directory.  A cache that was set before, as by `JAX_COMPILATION_CACHE_DIR`, stays the one that is used.
+    The key of a program is its code, its shapes and the versions of the compiler.  Each kind of processor has its own
+    folder, because its instructions may differ, so all machines can share the directory.  A cache that is already set,
+    for example by `JAX_COMPILATION_CACHE_DIR`, stays in use.
 
-    An entry that a killed process left half-written is removed first: JAX would refuse to write any other beside it.
+    A half-written entry of a killed process is removed first, because JAX would refuse to write other entries.
     """
     if jax.config.values["jax_compilation_cache_dir"] is not None:
         yield
@@ -66,9 +66,9 @@ def compilations_kept(directory: Path, least_s: float = WORTH_KEEPING_S) -> Iter
 def compiled_quickly() -> Iterator[None]:
     """Leave out most of XLA's optimisations inside the block: a training step compiles in a quarter of the time.
 
-    This pays for programs that run a few times only.  They compute the same up to rounding; their speed says nothing
-    about that of others.  The older loops stay chosen for the whole process where its first program is compiled inside
-    the block.
+    This pays only for programs that run a few times.  They compute the same up to rounding; their speed says nothing
+    about that of other programs.  If the first program of a process is compiled inside the block, the process keeps
+    the older loops.
     """
     flags, before = os.environ.get(FLAGS), jax.config.values["jax_disable_most_optimizations"]
     if OLDER_LOOPS not in (flags or ""):
@@ -85,11 +85,11 @@ def compiled_quickly() -> Iterator[None]:
 
 
 def committed(tree: Any) -> Any:
-    """The arrays of a tree committed to the default device, those that are committed to devices already as they are.
+    """The arrays of a tree, committed to the default device unless they are already committed.
 
     A compiled function has a program for each pattern of committed arguments.  Arrays of a checkpoint are committed,
-    fresh ones are not, and where one argument is, all results are: a step whose state mixes them would compile again
-    once its first results are its arguments.
+    new ones are not, and one committed argument commits all results: a step whose state mixes both would compile again
+    when it receives its first results.
     """
     (device,) = jnp.zeros(()).devices()
     place = lambda x: x if isinstance(x, jax.Array) and x.committed else jax.device_put(x, device)
@@ -109,14 +109,14 @@ def remove_half_written(folder: Path) -> int:
 
 
 def return_memory() -> None:
-    """Hand memory that was freed back to the system: XLA's compiler leaves half a gigabyte to the allocator (glibc)."""
+    """Return freed memory to the system: after compilation, the allocator (glibc) keeps half a gigabyte."""
     library = ctypes.CDLL(None)
     if hasattr(library, "malloc_trim"):
         library.malloc_trim(0)
 
 
 def drop_programs(share: float = MAPPINGS_SHARE) -> bool:
-    """Drop all compiled programs, and return True, where the process uses this share of its memory mappings.
+    """Drop all compiled programs, and return True, if the process uses this share of its memory mappings.
 
     XLA maps each kernel of a program for CPUs, some 2,000 mappings a training step, and beyond the limit of Linux
     (`vm.max_map_count`, by default 65,530) its compiler ends the process.  A dropped program is compiled again
@@ -134,7 +134,7 @@ def drop_programs(share: float = MAPPINGS_SHARE) -> bool:
 
 
 def processor() -> str:
-    """Name of this kind of processor: its architecture, and a digest of the instructions that it has."""
+    """Name of this kind of processor: its architecture and a digest of its instruction set."""
     path = Path("/proc/cpuinfo")  # Linux; elsewhere the name that the system gives must do
     lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
     flags = [line for line in lines if line.startswith(("flags", "Features"))]

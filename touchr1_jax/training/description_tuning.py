@@ -1,4 +1,4 @@
-"""Supervised fine-tuning of an ensemble of policies that read descriptions of touch, and GRPO after it."""
+"""Supervised fine-tuning, then GRPO, of an ensemble of policies that read descriptions of touch."""
 
 import dataclasses
 import functools
@@ -75,7 +75,7 @@ class Lesson:
     """Training data of a policy: n prompts of up to C touches of one object; those of weight 0 are never drawn.
 
     `percept` is the level by out-of-fold evidence about the touches, `target` the probability of each level of the
-    object: what the policy is taught to conclude is drawn from it anew in every step.
+    object; every step draws the conclusion that the policy learns from `target`.
     """
 
     x: Float[Array, "n C D"]
@@ -85,11 +85,11 @@ class Lesson:
 
 
 def reading_lesson(contacts: int, rows: int, seed: int) -> Lesson:
-    """Made-up evidence, and the answers that repeat it: the most likely levels perceived, the conclusion drawn from it.
+    """Synthetic evidence and answers that repeat it: perceived are the most likely levels, the conclusion is drawn.
 
     With p ~ Dirichlet(1, 1, 1) of each touch and attribute, p̄ their mean, and the input log p less its mean,
-    percept = argmax p̄ and conclusion ~ p̄³ / Σ p̄³: ridge regression shrinks its probabilities, and a policy that
-    repeats them would, by its own small errors, turn near ties.  This lesson costs no label.
+    percept = argmax p̄ and conclusion ~ p̄³ / Σ p̄³: ridge regression shrinks probabilities, and a policy that repeats
+    them would invert near ties by small errors.  This lesson needs no label.
 
     Args:
       contacts: C, the most touches; prompts hold 1 to C of them.
@@ -162,7 +162,7 @@ def _tune_program(policy: DescriptionPolicy, config: TuneConfig) -> tuple[optax.
 
 
 def disturb(key: Array, x: Float[Array, "n C D"], config: TuneConfig) -> Float[Array, "n C D"]:
-    """Inputs with some left out and noise on the rest; touches that do not exist stay so."""
+    """Inputs with some set to 0 and noise on the rest; inputs of missing touches do not change."""
     drop_key, noise_key = jax.random.split(key)
     kept = jax.random.bernoulli(drop_key, 1 - config.drop, x.shape)
     moved = jnp.where(kept, x + config.noise * jax.random.normal(noise_key, x.shape), 0.0) / (1 - config.drop)

@@ -4,15 +4,15 @@
 
 over the steps and streams that exist.  f is a causal `TactileViT`, f̄ its moving average, P a `LatentPredictor` that
 sees a random subset of the streams and is asked about all.  Standard deviation and covariance are those of f's latents
-before the layer norm *between contacts*: of one sensor at one step, across the batch.  Pooled over sensors and steps
-they would be satisfied by telling sensors and forces apart, which is no news.
+before the layer norm *between contacts*: of one sensor at one step, across the batch.  If pooled over sensors and
+steps, latents that only distinguish sensors and forces would satisfy them.
 
 Sources: Assran et al. 2023 (I-JEPA) for the objective; Bardes et al. 2022 (VICReg, §4.1) for the two terms, here with
-std = √(var + 1e-4); Grill et al. 2020 (BYOL) for the moving average.  Departures: the predictor is told time and force
-of the step that it predicts, and other sensors take part in the prediction.
+std = √(var + 1e-4); Grill et al. 2020 (BYOL) for the moving average.  Departures: the predictor receives time and force
+of the step that it predicts, and latents of other sensors.
 
-`DynamicsConfig.objective` selects one of three other objectives (see `objectives`), each with a head in the place of
-the predictor: contrast between sensors, prediction of hidden patches, force and depth.
+`DynamicsConfig.objective` selects one of three other objectives (see `objectives`), each with a head instead of the
+predictor: contrast between sensors, prediction of hidden patches, force and depth.
 """
 
 import dataclasses
@@ -69,7 +69,7 @@ FULL_SHARE = 0.5
 class DynamicsConfig:
     """Encoder and predictor.
 
-    With `frames_kept` only the most telling frames of each stream are read, see `salience.fewer_frames`.
+    With `frames_kept`, only the most salient frames of each stream are read (`salience.fewer_frames`).
     """
 
     encoder: TactileViTConfig
@@ -140,10 +140,10 @@ def encode_batch(config: TactileViTConfig, params: Params, batch: TouchBatch) ->
 
 
 def encode_each(config: TactileViTConfig, params: Params, batch: TouchBatch) -> Float[Array, "P S T N D"]:
-    """The same, contact by contact, for whoever needs no gradient: twice to three times faster on a CPU.
+    """The same, contact by contact, without gradient: two to three times faster on a CPU.
 
-    The activations of the stem then stay in a core's cache on their way to the next layer; eight contacts of 32 frames
-    have 25 MB of them, and the encoder waits for memory.  A gradient must keep them anyway and gains nothing.
+    The activations of the stem then stay in a core's cache until the next layer; those of eight contacts of 32 frames
+    take 25 MB and would have to be read from memory.  With a gradient, they must be stored anyway.
     """
     latent: Any = jax.lax.map(lambda x: TactileViT(config).apply({"params": params}, *x), _streams(batch))
     return latent
@@ -169,7 +169,7 @@ def predict_next(
 def dynamics_loss(
     config: DynamicsConfig, params: Params, target: Params, batch: TouchBatch, shown: Bool[Array, "P S"], guards: Guards
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """The loss of the module's formula and what it consists of.
+    """The loss of the module's formula and its terms.
 
     Args:
       config: networks.
@@ -244,7 +244,7 @@ def residuals(latent: Float[Array, "P S T N D"], exists: Bool[Array, "P S T"]) -
 def random_shown(key: Array, present: Bool[Array, "P S"], full_share: float) -> Bool[Array, "P S"]:
     """All present streams with probability `full_share`, else a random non-empty subset of them.
 
-    A subset keeps each stream with probability one half, and one stream chosen at random in any case.
+    A subset keeps each stream with probability one half, and always one stream chosen at random.
     """
     full_key, keep_key, one_key = jax.random.split(key, 3)
     full = jax.random.bernoulli(full_key, full_share, (present.shape[0], 1))
@@ -260,7 +260,7 @@ def head_of(config: DynamicsConfig, quantities: int = 0) -> Head:
 
 
 def contrast_terms(config: DynamicsConfig, params: Params, batch: TouchBatch) -> Float[Array, ""]:
-    """`contrast_loss` of each stream's mean latent; force and time, which alone identify a contact, are not shown."""
+    """`contrast_loss` of each stream's mean latent, without force and time, which would identify a contact."""
     batch = read_frames(config, batch)
     order = jnp.broadcast_to(jnp.arange(batch.frame_index.shape[-1]), batch.frame_index.shape)
     latent = encode_batch(

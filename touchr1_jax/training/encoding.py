@@ -29,7 +29,7 @@ def encode_contacts(fns: PolicyFns, params: Params, batches: Iterable[TouchBatch
 
 
 def touch_statistics(config: TactileViTConfig, batches: Iterable[TouchBatch]) -> TouchBatch:
-    """All contacts of some batches on the host, with the statistics of the stem in the place of the frames."""
+    """All contacts of some batches on the host, with the statistics of the stem instead of frames."""
     compute = jax.jit(functools.partial(statistics_of, c=config))
     changed = lambda batch: dataclasses.replace(batch, frames=compute(batch.frames, batch.frame_mask))
     found = [jax.device_get(changed(batch)) for batch in batches]
@@ -55,8 +55,8 @@ def noise_bank(
 ) -> Float[Array, "K S N D"]:
     """Encoded noise streams: pixels and forces drawn from N(μ, σ²) at each sensor's statistics, per channel.
 
-    The statistics are those of the batch's recorded frames; frame times are those of the contacts that a sensor
-    recorded, so that nothing but the touch itself is out of the ordinary.
+    The statistics are those of the batch's recorded frames, and frame times are those of the sensor's recorded
+    contacts, so that only the touch itself is unusual.
 
     Args:
       fns, params: of the encoder.

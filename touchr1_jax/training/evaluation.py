@@ -43,12 +43,12 @@ class Evaluation:
     """Greedy answers to every labelled question about some contacts; question n is about contact `contact[n]`.
 
     Attributes:
-      contact, attribute, streams: the question, and the streams that were shown.
+      contact, attribute, streams: the question, and the shown streams.
       tokens, parsed: the answer.
       label: −1 where not asked.
       truth: level of every attribute, −1 unknown, which rewards see; `None` where only `label` was kept.
-      alone: conclusions of the policy that is shown each stream alone; `None` where it was not asked so.
-      sampled: conclusions of n answers sampled at temperature 1 with all streams; `None` where none was.
+      alone: conclusions of the policy from each single stream; `None` if these were not asked.
+      sampled: conclusions of n answers sampled at temperature 1 with all streams; `None` if there are none.
       marginal: p(level | prompt), the mean over the sampled traces of p(level | trace) right after `conclude` opens,
         normalised over levels; where the tokenizer splits levels it is the share of the samples that conclude one.
     """
@@ -80,14 +80,14 @@ def evaluate_policy(
     """Ask every labelled question about every contact with all streams, and with each stream alone.
 
     Args:
-      policy, params: of whom is asked.
+      policy, params: the policy that answers.
       features: of the contacts, from `encoding.encode_contacts`.
       label: −1 for unknown, which is not asked about.
-      alone: ask with each stream alone too, where there are several.
-      samples: answers to each question that are sampled as well, with all streams.
+      alone: also ask with each stream alone, if there are several.
+      samples: number of sampled answers to each question, with all streams.
       batch_size: questions that are answered at once.
       answer: from (decoder, questions) to answers; by default the policy's own (`answer_program`).
-      progress: receives how many of how many answers are done.
+      progress: receives the number of finished answers and of all answers.
     """
     contact, attribute = labelled_questions(label)
     present = np.asarray(features.stream_mask)[contact]
@@ -128,7 +128,7 @@ def evaluate_policy(
 
 
 def in_flight(results: Iterable[T], number: int = AHEAD) -> Iterator[T]:
-    """The results in their order, each once so many later ones are dispatched: small programs leave cores idle."""
+    """The results in order, each after so many later ones are dispatched, because small programs leave cores idle."""
     waiting: collections.deque[T] = collections.deque()
     for result in results:
         waiting.append(result)
@@ -139,7 +139,7 @@ def in_flight(results: Iterable[T], number: int = AHEAD) -> Iterator[T]:
 
 @functools.cache
 def answer_program(policy: TouchPolicy, *, constrained: bool = False) -> Any:
-    """Compiled greedy decoder and parser, made once; a constrained one writes formatted answers alone."""
+    """Compiled greedy decoder and parser, made once; a constrained one writes only formatted answers."""
     grammar = policy.constraint if constrained else None
     return make_answer(policy.fns, policy.parser, policy.model.completion_tokens, grammar)
 
@@ -187,7 +187,7 @@ def reward_terms(
     """The part of each weighted reward in the total of each answer.
 
     Args:
-      policy: who answered.
+      policy: the policy that answered.
       evaluation: the answers.
       weights: of the rewards.
       prior: share of each level among the training labels.

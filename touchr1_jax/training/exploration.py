@@ -56,7 +56,7 @@ class WrittenTurns:
     def trajectories(
         self, choices: Int[np.ndarray, "n B"], question: Int[np.ndarray, "n"], level: Int[np.ndarray, "n"]
     ) -> Int[np.ndarray, "n T"]:
-        """Tokens of trajectories with these choices, `NO_CHOICE` from where they stop, and the answer after them."""
+        """Tokens of trajectories with these choices (`NO_CHOICE` after the last) and the answer after them."""
         n, budget = choices.shape
         made = choices != NO_CHOICE
         turns = np.full((n, budget + 1, self.actions.shape[1]), self.pad, np.int32)
@@ -129,8 +129,8 @@ def demonstration(
       policy, written: prompts, and the turns of its language.
       bank: contacts, on the host.
       which, attribute: object and question.
-      choices: in order, `NO_CHOICE` from where a trajectory concludes.
-      offered: choices that have not dropped out; by default all.  Of the others nothing is observed.
+      choices: in order, `NO_CHOICE` after the last.
+      offered: choices that have not dropped out; by default all.  Other choices observe nothing.
     """
     n = len(which)
     touch, exists = observed(bank, which, choices, offered)
@@ -208,8 +208,8 @@ class ActiveFeed(_BankFeed):
 class RandomTouchFeed(_BankFeed):
     """SFT batches: trajectories of 0 to `budget` different touches at random, then the label as answer.
 
-    Number and choice of the touches are uniform, so that nothing shows which touch is good.  The arguments are those of
-    `ActiveFeed`.
+    Number and choice of the touches are uniform, so that the batches do not show which touch is good.  The arguments
+    are those of `ActiveFeed`.
     """
 
     def __init__(self, policy: ActivePolicy, bank: TouchBank, *, budget: int, **options: Any) -> None:
@@ -242,13 +242,13 @@ def train_active(
     reward: TouchReward = priced_answer,
     seed: int = 0,
 ) -> Params:
-    """Reinforce a policy by GRPO on its own trajectories; the reference is where it starts.
+    """Train a policy by GRPO on its own trajectories; the reference is the initial policy.
 
     Args:
       policy: prompts, turns and forward passes.
       params: of the policy after its warm start.
       batches: `ActiveBatch`es of `config.drawn` prompts, for example of an `ActiveFeed`.
-      environment: what the actions are taken in.
+      environment: the environment of the actions.
       config: sizes of a step and algorithm; `length` is `policy.tokens(budget)`.
       loop: number of steps.
       hooks: log, checkpoints, devices.
@@ -259,7 +259,7 @@ def train_active(
 
     Raises:
       EnvironmentCheckError: an environment from which nothing can be learned.
-      RewardError: a reward that is not finite, or prices at which touching never pays.
+      RewardError: a reward that is not finite, or prices so high that touching never pays.
       ValueError: settings that trajectories cannot have.
     """
     check_exploration(policy, environment, peek(batches), prices=prices, budget=budget, reward=reward)
@@ -280,7 +280,7 @@ def check_exploration(
     budget: int,
     reward: TouchReward = priced_answer,
 ) -> None:
-    """Try environment and reward on a batch before training; of a `TouchBank`, all objects and questions.
+    """Try environment and reward on a batch before training; with a `TouchBank`, on all objects and questions.
 
     Raises:
       EnvironmentCheckError, RewardError: as `train_active`.

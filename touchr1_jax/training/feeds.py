@@ -1,8 +1,8 @@
 """Batches of SFT: clips with questions and verified answers.  Batches of GRPO are in `questions`.
 
 A feed wraps a Grain iterator and counts the batches that it made; its own randomness is a function of (seed, count), so
-that `set_state` resumes it exactly.  Batches are NumPy arrays: the step that takes one puts it on its devices, and a
-mesh splits it without fetching it back.  Put there array by array, each would wait while the threads that write a
+that `set_state` resumes it exactly.  Batches are NumPy arrays: the step puts a batch on its devices, and a mesh
+splits it without fetching it back.  If the feed put each array on a device, it would wait while threads that write a
 checkpoint hold Python's lock.
 """
 
@@ -58,17 +58,17 @@ class Feed:
 
 
 def host_touch(clip: Mapping[str, Any]) -> TouchBatch:
-    """The arrays of a clip batch as the JAX batch type, on the host; they must not be written to any more."""
+    """The arrays of a clip batch as the JAX batch type, on the host; do not change them afterwards."""
     return TouchBatch(**{field.name: clip[field.name] for field in dataclasses.fields(TouchBatch)})
 
 
 def touch_batch(clip: Mapping[str, Any]) -> TouchBatch:
-    """The same on the device, to compute with it outside of a compiled program."""
+    """The same on the device, for computation outside a compiled program."""
     return jax.device_put(host_touch(clip))
 
 
 def take(features: Features, rows: np.ndarray) -> Features:
-    """Rows of encoded contacts, on the host as these are."""
+    """Rows of encoded contacts on the host."""
     return jax.tree.map(lambda x: x[rows], features)
 
 
@@ -81,7 +81,7 @@ def encoded_clips(
     seed: int,
     own: np.ndarray | None = None,
 ) -> grain.IterDataset:
-    """Encoded contacts in random order, again and again, in the place of the clips of an `AnswerFeed`.
+    """Endless batches of encoded contacts in random order, instead of the clips of an `AnswerFeed`.
 
     Args:
       features: of n contacts.
@@ -225,7 +225,7 @@ def verified_answer(
     label: Int[np.ndarray, "A"],
     streams: Bool[np.ndarray, "S"],
 ) -> tuple[Int[np.ndarray, "T"], Bool[np.ndarray, "T"]]:
-    """Tokens of the answer that SFT imitates, and which of them count: none where the label is unknown.
+    """Tokens of the answer that SFT imitates, and which of them count: none if the label is unknown.
 
     Args:
       policy: prompts and vocabulary.

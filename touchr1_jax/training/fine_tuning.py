@@ -2,7 +2,7 @@
 
     L = mean −log softmax(W h)_label over the known labels,   h = LN(tokens of each stream, mean over its steps)
 
-The head starts at zero, so that every encoder starts from the same answers.
+The head starts at zero, so that all encoders start from the same answers.
 """
 
 import dataclasses
@@ -85,7 +85,7 @@ def label_cost(log_p: Float[Array, "P A K"], label: Int[Array, "P A"]) -> Float[
 def level_log_probs(
     config: FineTuned, params: Params, batch: TouchBatch, *, encode: Callable[..., Any] = encode_each
 ) -> Float[Array, "P A K"]:
-    """Log-probability of every level of every attribute; −∞ for a level that an attribute lacks."""
+    """Log-probability of every level of every attribute; −∞ for levels that an attribute lacks."""
     features = _features(config, params["encoder"], batch, encode)
     return normalised_levels((features @ params["head"]).reshape(len(features), len(config.levels), -1), config.levels)
 

@@ -26,9 +26,9 @@ class KernelProbeConfig:
     """The probes.
 
     Args:
-      families: of numbers, each with a probe of its own.
+      families: of numbers, one probe for each family.
       ridge: λ; the kernel's diagonal is 1.
-      folds: parts of the training objects, each read by probes on the others.
+      folds: parts of the training objects; probes fitted on the other parts read each part.
     """
 
     families: tuple[str, ...]
@@ -82,7 +82,7 @@ def cross_probe(
     config: KernelProbeConfig,
     seed: int,
 ) -> Float[np.ndarray, "n M A K"]:
-    """As `probe`, but a video of the fit is read by probes that saw no video of its object."""
+    """As `probe`, but only probes that saw no video of the same object read a video of the fit."""
     found = probe(x, target, weight, family, config)
     names = np.unique(objects[weight > 0])
     order = np.random.default_rng(seed).permutation(len(names))
@@ -101,12 +101,12 @@ def graded_targets(
     share: float,
     width: float,
 ) -> Float[np.ndarray, "n A K"]:
-    """Targets that are in part the label, in part the probability of each level given how people rated the object.
+    """Targets that mix the label and the probability of each level given people's rating of the object.
 
         t = (1 − share) onehot(y) + share p,   p_k = (Σ_j w_j g_ij 1[y_j = k] + π μ_k) / (Σ_j w_j g_ij + π)
 
     over videos j of other objects, with g_ij = exp(−(r_i − r_j)² / 2 width²), π = 0.1 and μ the weighted mean.  A label
-    that contradicts the rating weighs less.
+    that contradicts the rating has less weight.
 
     Args:
       label, rating: levels, and ratings on one scale for all objects; a rating of NaN is unknown, its target one-hot.
@@ -144,7 +144,7 @@ def kernel_ridge(
 
 
 def ranks(x: Float[np.ndarray, "n D"], among: Float[np.ndarray, "m D"]) -> Float[np.ndarray, "n D"]:
-    """Normal quantiles of each number's rank among reference rows: what any monotone change of a number leaves."""
+    """Normal quantiles of each number's rank among reference rows, invariant to monotone changes of a number."""
     sorted_ = np.sort(among, 0)
     sides = [[np.searchsorted(sorted_[:, d], x[:, d], side) for d in range(x.shape[1])] for side in ("left", "right")]
     middle = (np.sum(sides, 0).T + 1) / 2 / (len(among) + 1)

@@ -31,7 +31,7 @@ def probe_right(
     train: Bool[np.ndarray, "n"],
     config: ProbeConfig,
 ) -> Bool[np.ndarray, "test A"]:
-    """Correctness of the probe of each ordinal attribute on each contact that it was not fitted on.
+    """Correctness of each ordinal attribute's probe on each contact outside its fit.
 
     Args:
       features: one row per contact.
@@ -64,7 +64,7 @@ def rank_me(rows: Float[Array, "n D"]) -> Float[Array, ""]:
 def told_apart(latent: Float[AnyArray, "P S T N D"], exists: Bool[AnyArray, "P S T"]) -> Float[Array, ""]:
     """Variation between contacts relative to the latents, √(Σ (z − z̄)² / Σ z²), z̄ of one sensor, step and token.
 
-    The share that is left for a decoder that normalises what it reads: the scale of the latents does not enter.
+    A decoder that normalises its input can use only this share; the scale of the latents has no effect.
     """
     size = jnp.sum(jnp.where(exists[..., None, None], latent, 0.0) ** 2)
     return jnp.sqrt(jnp.sum(residuals(jnp.asarray(latent), jnp.asarray(exists)) ** 2) / size)
@@ -84,15 +84,15 @@ below .1, strikes also where latents are merely small.
 
 
 def collapse_alarms(before: Mapping[str, float], now: Mapping[str, float]) -> list[Alarm]:
-    """F11: signs that latent prediction has collapsed: a bound passed at two readings in a row, and not recovering.
+    """F11: latent prediction has collapsed: two measurements in a row pass a bound, without recovery.
 
         m_{t−1} ≤ bound,   m_t ≤ bound,   m_t ≤ m_{t−1}
 
-    A moving target falls below its bound for some dozen steps of a sound run, and rises again.
+    In a healthy run, a moving target can be below its bound for some dozen steps before it rises again.
 
     Args:
-      before: the reading before, of the trained encoder; any of the names of `BOUNDS`, others are ignored.
-      now: the present reading.
+      before: the previous measurement, of the trained encoder; names outside `BOUNDS` are ignored.
+      now: the present measurement.
     """
     return [
         Alarm(code="F11", meaning=meaning, value=now[name], bound=bound)

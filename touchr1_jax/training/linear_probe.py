@@ -1,8 +1,8 @@
 """Linear probes, and the targets that they give the `perceive` and `compare` slots in supervised fine-tuning.
 
-These slots must not repeat the object's label: cross-sensor consistency would start at 1 and could teach nothing.
-Instead a multinomial probe on fixed features of one stream is fitted on the other folds of objects and evaluated on the
-held-out fold, so that its levels are as fallible as that sensor is.
+These slots must not repeat the object's label: cross-sensor consistency would start at 1 and give no gradient.
+Instead, a multinomial probe on fixed features of one stream is fitted on the other folds of objects and evaluated on
+the held-out fold, so that its levels have the errors of that sensor.
 """
 
 import dataclasses
@@ -110,8 +110,8 @@ def sensor_evidence(
 ) -> Float[np.ndarray, "n S A K"]:
     """Out-of-fold log-probabilities of each sensor's own probe for every attribute.
 
-    Levels that an attribute lacks have −∞.  A stream that was not recorded gives 0 for every level, and so does every
-    stream about an attribute that too few groups are annotated for.
+    Levels that an attribute lacks have −∞.  A stream that was not recorded gives 0 for every level; so does every
+    stream if too few groups have labels of the attribute.
 
     Args:
       features: of every contact's streams.
@@ -121,7 +121,8 @@ def sensor_evidence(
       levels: K of each attribute.
       config: folds and fit.
       track: passes the (attribute, sensor) pairs through, for example under a progress bar.
-      read_only: rows of other groups that a probe of all the other rows reads and none is fitted on; none by default.
+      read_only: rows of other groups that no probe is fitted on and that a probe of all other rows reads; none by
+        default.
     """
     n, sensors = present.shape
     read_only = np.zeros(n, bool) if read_only is None else read_only
@@ -144,7 +145,7 @@ def group_folds(groups: np.ndarray, config: ProbeConfig, field: str = "groups") 
     """Fold of each row, 0 … folds − 1, dealt at random to whole groups by a fixed seed.
 
     Args:
-      groups: identity of each row whose rows stay together.
+      groups: identity whose rows stay together.
       config: number of folds.
       field: what an error calls the groups.
 

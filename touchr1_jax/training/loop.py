@@ -35,7 +35,7 @@ HELD_OUT = "held_out"
 
 @runtime_checkable
 class Batches(Protocol):
-    """An iterator of batches that can say where it is and go back there; Grain's iterators are such."""
+    """An iterator of batches with a position that can be saved and restored, such as Grain's."""
 
     def __next__(self) -> Any: ...
     def __iter__(self) -> Iterator[Any]: ...
@@ -49,9 +49,9 @@ class NonFiniteGradientError(RuntimeError):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LoopConfig:
-    """Number of steps, every how many a checkpoint is saved, and how many updates in a row may be left out.
+    """Number of steps, steps between checkpoints, and how many updates in a row may be left out.
 
-    An update is left out where its gradient is not finite (see `skipping.skip_nonfinite`).
+    An update is left out if its gradient is not finite (see `skipping.skip_nonfinite`).
     """
 
     steps: int
@@ -65,13 +65,13 @@ class LoopConfig:
 
 @dataclasses.dataclass
 class LoopTime:
-    """Wall time of a loop's steps in one session from the second one on, for the first compiles.
+    """Wall time of a loop's steps in one session, without the first step, which compiles.
 
     Attributes:
-      steps: how many they were.
-      total_s: what they took, saving included.
-      input_s: at most the part of it in which the device had nothing to do because the next batch was not there: of a
-        batch that came once the device had finished, the whole time of making it counts.
+      steps: their number.
+      total_s: their time, including saving.
+      input_s: upper bound of the part in which the device waited for the next batch: if a batch came after the device
+        had finished, the whole time of making the batch counts.
     """
 
     steps: int = 0
@@ -79,19 +79,19 @@ class LoopTime:
     input_s: float = 0.0
 
     def add(self, step_s: float, waited_s: float) -> None:
-        """One more step: what it took, and how much of that it waited."""
+        """Add a step: its time, and how much of it was waiting."""
         self.steps += 1
         self.total_s += step_s
         self.input_s += waited_s
 
     @property
     def input_share(self) -> float:
-        """Share of the time that waited for data; 0 where no step was timed."""
+        """Share of the time spent waiting for data; 0 if no step was timed."""
         return self.input_s / self.total_s if self.total_s else 0.0
 
 
 class SingleDevice:
-    """Training steps run on one device, as they are; a subclass splits them over a mesh."""
+    """Training steps on one device, unchanged; a subclass splits them over a mesh."""
 
     shape: tuple[int, ...] = (1, 1, 1)
     """Devices along the axes of the mesh."""
@@ -128,14 +128,14 @@ class Hooks:
     """Side effects of a training stage; by default it has none and runs on one device.
 
     Attributes:
-      log: receives (step, metrics) in order, each one step late; of a step whose update was left out it receives the
-        finite metrics and `SKIPPED`.
-      checkpoints: where state and batches are saved and restored from; `None` saves nothing.
+      log: receives (step, metrics) in order, each one step late; if an update was left out, the finite metrics and
+        `SKIPPED`.
+      checkpoints: save and restore state and batches; `None` saves nothing.
       resumed: receives the first step that is computed, 0 or that of the checkpoint, before any step.
-      stopping: asked after every step; once it is true the state is saved and returned as it is.
-      times: receives how long steps took and how long they waited for data.
+      stopping: called after every step; if it is true, the state is saved and returned.
+      times: receives the time of steps and their waiting for data.
       devices: where the steps run.
-      sampled: receives (step, sample) where the step returns a sample; `None` asks for none.
+      sampled: receives (step, sample) if the step returns a sample; `None` requests no samples.
     """
 
     log: Log = lambda step, metrics: None
@@ -159,15 +159,16 @@ def fit(
     *,
     held_out: Callable[[Any], float] | None = None,
 ) -> Any:
-    """Run `step` to `config.steps`, continuing from the newest checkpoint where there is one.
+    """Run `step` to `config.steps`, continuing from the newest checkpoint if there is one.
 
-    Step t is dispatched, then batch t + 1 is made, then the metrics of step t − 1 are fetched: all of it while the
-    device computes, so that it waits for none of it, and after a save the next batch is there.  Resuming restores state
+    Step t is dispatched, then batch t + 1 is made, then the metrics of step t − 1 are fetched: all this happens while
+    the device computes, so that the device does not wait, and after a save the next batch is ready.  Resuming restores
+    state
     and data iterator together: the result equals the uninterrupted run's bit for bit.
 
     Args:
       step: (state, batch) → (state, metrics).
-      state: where a run without a checkpoint begins.
+      state: initial state of a run without checkpoint.
       batches: training data.
       config: number of steps, of steps between checkpoints, and of updates in a row that may be left out.
       hooks: log, checkpoints, stop signal.
@@ -214,7 +215,7 @@ def fit_best(
     *,
     held_out: Callable[[Any], float] | None,
 ) -> Any:
-    """`fit`, and of the checkpoints the one with the highest held-out score; the last state without `held_out`.
+    """`fit`, then return the checkpoint with the highest held-out score; without `held_out`, the last state.
 
     Args:
       step, state, batches, config, hooks, held_out: as in `fit`.
@@ -232,7 +233,7 @@ def fit_best(
 
 
 def peek(batches: Batches) -> Any:
-    """The next batch, which is made again when it is asked for."""
+    """The next batch; the iterator will return it again."""
     place = batches.get_state()
     first = next(batches)
     batches.set_state(place)
@@ -240,7 +241,7 @@ def peek(batches: Batches) -> Any:
 
 
 def resume(state: Any, batches: Batches, checkpoints: Checkpoints | None) -> tuple[int, Any]:
-    """Step and state of the newest intact checkpoint, to which the batches are set; 0 and `state` without one."""
+    """Step and state of the newest intact checkpoint, whose position the batches get; without one, 0 and `state`."""
     restored = None if checkpoints is None else checkpoints.restore(state)
     if restored is None:
         return 0, state

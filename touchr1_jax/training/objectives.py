@@ -1,6 +1,6 @@
-"""Objectives of stage 1 on arrays: what an encoder can learn from touch without labels.
+"""Objectives of stage 1 on arrays, which train an encoder on touch without labels.
 
-`dynamics` computes their arguments with networks; its own objective, the prediction of the next latent, is there.
+`dynamics` computes their arguments with networks and contains its own objective, prediction of the next latent.
 """
 
 from typing import Literal
@@ -66,7 +66,7 @@ def measured_loss(
 def measured_targets(
     force_n: Float[Array, "*n 3"], depth_mm: Float[Array, "*n q"]
 ) -> tuple[Float[Array, "*n k"], Bool[Array, "*n k"]]:
-    """Force and depth on scales of about unit spread, and which of them are known.
+    """Force and depth on scales of about unit spread, and a mask of the known ones.
 
     (f / 10 N, log(1 + |f_z| / .1 N) − 2, log(1 + d / .01 mm) for each measure d of depth); k = 4 + q.
 

@@ -1,4 +1,4 @@
-"""The optimizers of the stages.  All of them leave out an update whose gradient is not finite, and count it."""
+"""The optimizers of the stages.  They leave out updates whose gradient is not finite, and count them."""
 
 import dataclasses
 
@@ -41,7 +41,7 @@ def falling_adamw(
 ) -> optax.GradientTransformation:
     """Clip the global gradient norm, then AdamW without decay of weights: the optimizer of GRPO.
 
-    The learning rate falls linearly to `final_share` of itself over `steps` updates; 1 keeps it constant.
+    The learning rate falls linearly to `final_share` of its start over `steps` updates; 1 keeps it constant.
     """
     schedule = optax.linear_schedule(learning_rate, final_share * learning_rate, steps)
     adamw = optax.adamw(schedule, weight_decay=0.0)

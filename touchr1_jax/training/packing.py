@@ -1,10 +1,10 @@
-"""Question–answer pairs of different length put into rows of one width, so that little of what is computed is padding.
+"""Packing of question–answer pairs of different lengths into rows of one width, with little padding.
 
     P contacts × Q questions, each L prompt and T answer tokens, some of which exist  →  rows of W tokens, mostly full
 
-A row holds whole examples, one after the other; the decoder lets none of them see another.  Where a token of a row
-comes from is all that a packed batch says: ids, embeddings and positions are those of the padded one.  It is made on
-the host, in NumPy (`pack_rows`), as a function of the batch alone, and read in the compiled step (`row_of`).
+A row holds whole examples, one after the other; in the decoder, no example sees another.  A packed batch states only
+the source of each token of a row: ids, embeddings and positions are those of the padded batch.  `pack_rows` makes it on
+the host, in NumPy, from the batch only; `row_of` reads it in the compiled step.
 """
 
 import dataclasses
@@ -26,7 +26,7 @@ from touchr1_jax.types import TouchBatch
 class Packing:
     """Rows of `width` tokens, shared by the questions about `contacts` contacts.
 
-    They are contacts of one micro-batch of the gradient, of which a batch has `micro_batches`, and of one device.
+    These contacts belong to one device and to one of the `micro_batches` micro-batches of the gradient.
 
     Raises:
       ValueError: a number below 1.
@@ -44,10 +44,10 @@ class Packing:
 
 @struct.dataclass
 class PackedRows:
-    """Rows of W tokens, of which K states at most predict a token of an answer.
+    """Rows of W tokens, of which at most K states predict a token of an answer.
 
-    The rows of a group of contacts stand where its contacts do, r for each, those that hold something first.  There are
-    so many that the examples of a group always fit; a step computes those alone that hold something.
+    The rows of a group of contacts are at the places of its contacts, r for each contact, nonempty rows first.  There
+    are enough rows for all examples of any group; a step computes only nonempty rows.
 
     Attributes:
       source: number of the token among the L + T of every example of its group, example by example; −1 is padding.
@@ -74,7 +74,7 @@ def existing_tokens(
     An example without an answer teaches nothing, and none of its tokens exists.
 
     Args:
-      policy: says which frames make a time step.
+      policy: defines the frames of a time step.
       slots: of the prompt.
       touch: on the host.
       mask, streams, token_mask: as in `SFTBatch`.
@@ -136,7 +136,7 @@ def pack_rows(exists: Bool[np.ndarray, "P Q n"], token_mask: Bool[np.ndarray, "P
 def first_fit(sizes: Int[np.ndarray, "E k"], room: Sequence[int]) -> Int[np.ndarray, "E"]:
     """Row of each example, the largest first, each into the first row that has room of every kind.
 
-    Where any m examples fit into a row, E of them take ⌈E/m⌉ rows at most.  Examples of no size get row −1.
+    If any m examples fit into a row, E examples take at most ⌈E/m⌉ rows.  Examples of no size get row −1.
 
     Args:
       sizes: of each example, of k kinds; the first decides which is larger.
@@ -158,13 +158,13 @@ def first_fit(sizes: Int[np.ndarray, "E k"], room: Sequence[int]) -> Int[np.ndar
 
 
 def filled(rows: PackedRows) -> tuple[int, int]:
-    """Tokens that exist, and tokens that are computed for them, where one group is computed at a time."""
+    """Number of existing tokens, and of computed tokens if one group is computed at a time."""
     source = np.asarray(rows.source)
     return int((source >= 0).sum()), int((source >= 0).any(-1).sum()) * source.shape[-1]
 
 
 class Tokens(NamedTuple):
-    """All tokens of examples, n = L + T of each, whether they exist or not.
+    """All tokens of examples, n = L + T each, existing or not.
 
     `feature` is the number of a tactile or view token among those of a group's contacts, −1 for a word.
     """
@@ -218,7 +218,7 @@ def row_of(tokens: Tokens, source: Int[Array, "W"], predicts: Int[Array, "K"]) -
 
     Args:
       tokens: of the examples of the group, [E].
-      source, predicts: as in `PackedRows`; at place 0 where there is none.
+      source, predicts: as in `PackedRows`; place 0 if there is none.
     """
     n = tokens.ids.shape[-1]
     example, slot = jnp.maximum(source, 0) // n, jnp.maximum(source, 0) % n

@@ -1,6 +1,6 @@
-"""Encoder pretraining: its configuration, first state and compiled step, and measurements of the encoder that it makes.
+"""Encoder pretraining: its configuration, first state and compiled step, and measurements of the resulting encoder.
 
-The objective is that of `dynamics`.  Measured are how well the next latent is predicted and what linear probes read.
+The objective is that of `dynamics`.  Measurements are the error of the next latent and the accuracy of linear probes.
 """
 
 import dataclasses
@@ -105,7 +105,7 @@ def encoder_of(
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class EncoderAssessment:
-    """Measurements of one encoder, by contact where intervals resample objects.
+    """Measurements of one encoder, by contact if intervals resample objects.
 
     Args:
       error, copied, constant: [n] mean error of the prediction, of the last latent, of each step's mean latent.
@@ -150,7 +150,7 @@ def assess(
     """Measure the averaged encoder and the predictor on n contacts; all streams that exist are shown.
 
     Args:
-      networks, state: what was trained.
+      networks, state: the trained encoder and predictor.
       encode_all: applies a function to all contacts, batch by batch.
       fitted: contacts of known labels, on which probes and constant predictions are fitted; the others are scored.
       probe_right: from latents and existing steps of all contacts to bool [scored, 3], the answers of the probes.

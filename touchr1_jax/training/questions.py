@@ -15,15 +15,15 @@ from touchr1_jax.training.feeds import ONE_AT_A_TIME, Feed, random_streams, take
 
 
 class NoLabelsError(ValueError):
-    """Contacts of which no label is known, so that nothing can be asked about them."""
+    """Contacts without any known label, so that no question can be asked about them."""
 
 
 class QuestionFeed(Feed):
     """GRPO batches: encoded contacts in random order, each with the question for one attribute.
 
-    Where several processes share a batch, each makes the rows `own` of it.  `truth` [n, A] are all levels that are
-    known, which rewards see; by default those of `label`, which may be asked about.  With `evidence` [n, S, A, K] of
-    the sensors' probes each question comes with its verified answer (`feeds.verified_answer`).
+    If several processes share a batch, each makes its rows `own`.  Questions ask about levels of `label`; rewards see
+    all known levels, `truth` [n, A], by default those of `label`.  With `evidence` [n, S, A, K] of the sensors' probes,
+    each question has its verified answer (`feeds.verified_answer`).
     """
 
     def __init__(

@@ -3,9 +3,9 @@
     vllm serve DIR --enable-prompt-embeds --enable-lora --max-lora-rank 16 --logprobs-mode processed_logprobs
     (with VLLM_ALLOW_RUNTIME_LORA_UPDATING=True)
 
-Each step writes the adapters of the decoder in PEFT's format, has the server load them under a new name, asks for a
-group of completions of every embedded prompt, and has them unloaded.  The update is the program of `rl.grpo`, which
-takes the rollouts as arrays.
+Each step writes the adapters of the decoder in PEFT's format, makes the server load them under a new name, requests a
+group of completions of every embedded prompt, and makes the server unload the adapters.  The update is the program of
+`rl.grpo`, which takes the rollouts as arrays.
 """
 
 import concurrent.futures
@@ -99,7 +99,7 @@ class RolloutServer:
         self._opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))  # a server is near: by no proxy
 
     def check(self, policy: ReleasedPolicy, config: GRPOConfig, devices: SingleDevice) -> None:
-        """Refuse, before anything is made, what a server cannot do, and a server that is not there.
+        """Refuse, before any work, settings that a server does not support, and a server that does not answer.
 
         Args:
           policy: with its adapters.
@@ -130,7 +130,7 @@ class RolloutServer:
     def before(
         self, step: Step, policy: ReleasedPolicy, table: Float[Array, "V D"], config: GRPOConfig, devices: SingleDevice
     ) -> Step:
-        """The step of GRPO, which now gets rollouts that the server has drawn; where they fail, nothing has changed.
+        """The step of GRPO with rollouts drawn by the server; if these fail, nothing has changed.
 
         Args:
           step: (state, batch) → (state, metrics), by adapters.
@@ -167,7 +167,7 @@ class RolloutServer:
           policy, table, config: as in `before`.
 
         Raises:
-          RolloutError: a server that is not there, refuses, does not answer in time or answers something else.
+          RolloutError: a server that is missing, refuses, or gives no valid answer in time.
         """
         x, exists = jax.device_get(embedded_prompts(table, batch, policy.fns.slots))
         with self._serving(policy, adapters) as name:

@@ -1,7 +1,7 @@
-"""Stage 2, supervised fine-tuning: imitate verified answers, the loss on the answer's tokens alone.
+"""Stage 2, supervised fine-tuning: imitate verified answers, with a loss on the answers' tokens only.
 
-Every contact is encoded once and answers Q questions, so the encoder's cost is shared.  A batch of contacts that are
-encoded already trains the decoder alone, with the same loss.  The gradient is summed over
+Every contact is encoded once and answers Q questions, so the encoder's cost is shared.  A batch of encoded
+contacts trains only the decoder, with the same loss.  The gradient is summed over
 micro-batches of contacts, and logits of a large vocabulary exist for some tokens at a time only.  Questions with their
 answers are padded to one length, or packed into rows (`packing`), which gives the same gradient.
 """
@@ -31,8 +31,8 @@ from touchr1_jax.types import Params, TouchBatch
 class SFTBatch:
     """P contacts with Q question–answer pairs each; `streams` says which sensors a question may feel.
 
-    `touch` is a `TouchBatch`, or what the encoder made of it: then no gradient reaches the encoder.  Of trajectories it
-    is their `Explored` observations, with Q = 1.
+    `touch` is a `TouchBatch`, or its encoded features; then no gradient reaches the encoder.  For trajectories, `touch`
+    is their `Explored` observations, and Q = 1.
     """
 
     touch: Any
@@ -70,7 +70,7 @@ def make_sft_step(
       fns: policy, prompts, vocabulary.
       optimizer: applied to the gradient of `sft_loss`.
       blind: train without touch.
-      max_logits: so many may exist at once (see `models.chunked_logits`).
+      max_logits: most logits that exist at once (see `models.chunked_logits`).
       micro_contacts: contacts of a micro-batch, whose working set stays in cache; `None` takes all at once.
     """
 
@@ -97,8 +97,8 @@ def sft_gradient(
 ) -> tuple[tuple[Float[Array, ""], Float[Array, ""]], Params]:
     """Result of `sft_loss` for the batch, and the gradient of the loss, summed over micro-batches.
 
-    Neighbours are in different micro-batches: where devices share the contacts, each then has some of every one.  Of a
-    packed batch the rows are computed, group beside group and one row of each after the other.
+    Neighbours are in different micro-batches, so if devices share the contacts, each has some of every micro-batch.  A
+    packed batch is computed by rows: groups in parallel, and the rows of a group one after the other.
 
     Raises:
       ValueError: contacts that do not divide into micro-batches, or rows that were packed for others.
@@ -193,13 +193,13 @@ def row_scores(
     predicts: Int[Array, "K"],
     max_logits: int = MAX_LOGITS,
 ) -> Rows:
-    """Log-probability `log_prob` [K] of what follows each predicting place of a row, and whether it is `right`.
+    """Log-probability `log_prob` [K] of the token after each predicting place of a row, and whether it is `right`.
 
     Args:
       fns, params, max_logits: as in `sft_gradient`.
       seen: encoded touch and view of the contacts of a group.
       tokens: of the examples of the group.
-      source, predicts: the row, as in `PackedRows`; what is said of places that are none means nothing.
+      source, predicts: the row, as in `PackedRows`; results for places −1 have no meaning.
     """
     row, following = row_of(tokens, source, predicts)
     states = fns.packed_states(params, seen, row)
@@ -207,14 +207,14 @@ def row_scores(
 
 
 def encoded(fns: PolicyFns, params: Params, batch: SFTBatch, *, blind: bool = False) -> Any:
-    """The features of a batch's contacts; those that it carries are taken as they are."""
+    """The features of a batch's contacts, encoded if necessary."""
     return fns.encode(params, batch.touch, blind=blind) if isinstance(batch.touch, TouchBatch) else batch.touch
 
 
 def encoded_group(
     fns: PolicyFns, params: Params, batch: SFTBatch, *, blind: bool = False
 ) -> tuple[Float[Array, "P n E"], Features]:
-    """Tokens of each contact's streams and view, one after the other, and the features that they are of."""
+    """Tokens of each contact's streams and view, one after the other, and their features."""
     features = encoded(fns, params, batch, blind=blind)
     touch = features.touch.reshape(len(features.touch), -1, features.touch.shape[-1])
     levels = features.view.shape[-1] - touch.shape[-1]  # of a vision tower with DeepStack; touch has none

@@ -1,12 +1,12 @@
-"""Supervised training of a policy's encoders by a linear head, before its decoder is trained on what they encode.
+"""Supervised training of a policy's encoders with a linear head, before the decoder is trained on encoded contacts.
 
     L = mean −log softmax(b + W h)_label over known labels,   h = (Σ touch tokens / √n, Σ view tokens / √m)
 
-Every contact has one label of each attribute in each step, and no token has to be predicted that is not a level: per
-contact this teaches the encoders several times as much as the answers do.  The head reads the n touch tokens of all
-sensors and time steps by the same weights, as attention can: what it reads, the decoder soon does.  A head with weights
-of its own for each token fits better, and teaches the decoder less.  Half of the contacts show a random part of their
-sensors, so that the tokens of each sensor alone tell the levels.
+Each step uses one label of each attribute of a contact and predicts only levels, so the encoders learn several times as
+much per contact as from answers.  The head reads the n touch tokens of all sensors and time steps with the same
+weights, as attention can, so the decoder soon learns to read them too.  A head with separate weights for each token
+fits better but helps the decoder less.  Half of the contacts show a random part of their sensors, so that the tokens
+of each single sensor indicate the levels.
 """
 
 import dataclasses
@@ -58,12 +58,12 @@ def train_encoder(
     *,
     seed: int = 0,
 ) -> Params:
-    """Train everything of a policy but its decoder and its frozen towers; the head is not kept.
+    """Train all of a policy except its decoder and frozen towers; the head is discarded.
 
     Args:
       policy: its forward passes, attributes and levels.
-      params: where it begins.
-      batches: `TouchBatch`es with labels, −1 where one is unknown, for example of `touch_rows`.
+      params: initial parameters.
+      batches: `TouchBatch`es with labels, −1 if unknown, for example of `touch_rows`.
       config: steps and optimizer.
       hooks: log, checkpoints, devices.
       seed: of the sensors that are shown.
@@ -124,7 +124,7 @@ def head_log_probs(levels: Sequence[int], head: Params, features: Features) -> F
 
 
 def read_tokens(features: Features) -> Float[Array, "P W"]:
-    """Input of the head, h: the sums of the tokens of touch and of view over the roots of their numbers."""
+    """Input of the head, h: the sums of touch and of view tokens, each divided by the root of their number."""
     exists = features.stream_mask[..., None] & (features.touch_time >= 0)
     touch = features.touch.reshape(len(features.touch), -1, features.touch.shape[-1]).astype(jnp.float32)
     exists = jnp.broadcast_to(exists, features.touch.shape[:-1]).reshape(touch.shape[:-1])
@@ -151,11 +151,11 @@ def some_streams(key: Array, present: Bool[Array, "P S"]) -> Bool[Array, "P S"]:
 def touch_rows(
     touch: TouchBatch, rows: np.ndarray, *, batch_size: int, seed: int, own: np.ndarray | None = None
 ) -> Batches:
-    """Batches of some contacts on the host in random order, again and again.
+    """Endless batches of some contacts on the host in random order.
 
     Args:
       touch: all contacts.
-      rows: those to train on.
+      rows: contacts to train on.
       batch_size, seed: of the batches and their order.
       own: rows of a batch that this process reads; all by default.
     """

@@ -47,21 +47,21 @@ def train_grpo(
     rollouts: RolloutServer | None = None,
     held_out: Callable[[Params], float] | None = None,
 ) -> Params:
-    """Reinforce the decoder of a policy by GRPO; both encoders stay as they are, and the reference is where it starts.
+    """Train the decoder of a policy by GRPO; both encoders are frozen, and the reference is the initial policy.
 
-    Of a policy with adapters they alone are trained, on from where SFT left them.
+    If the policy has adapters, only these are trained, starting from those of SFT.
 
     Args:
       policy: its prompts and forward passes.
       params: of the policy after SFT.
       batches: `GRPOBatch`es of `config.drawn` prompts, for example of a `QuestionFeed`.
-      score: reward of one rollout (see `rl.scoring.make_score`); programs are compiled once for each such object.
+      score: reward of one rollout (see `rl.scoring.make_score`); each such object compiles its programs once.
       config: sizes of a step and algorithm.
       loop: number of steps.
       hooks: log, checkpoints, devices.
       noise: encoded noise streams of the policy's encoder (`encoding.noise_bank`).
-      seed: of rollouts, and of adapters where there are none yet.
-      rollouts: server that draws them, of a policy on released weights; by default the step does.
+      seed: of rollouts, and of new adapters.
+      rollouts: server that draws rollouts of a policy on released weights; by default the step draws them.
       held_out: as in `train_sft`.
 
     Raises:
@@ -95,7 +95,7 @@ def train_grpo(
 
 
 def check_rewards(rewards: Mapping[str, AnyReward], weights: Mapping[str, float], language: Language) -> None:
-    """Try every weighted reward on an empty answer, so that a misfit is reported before anything is made.
+    """Try every weighted reward on an empty answer, to report errors before any work.
 
     Raises:
       RewardError: an unknown reward, a weight that is negative or not finite, a reward that is no floating scalar,
@@ -158,7 +158,7 @@ def check_whole_batch(
     noise: Float[Array, "K S N D"],
     seed: int,
 ) -> None:
-    """`check_streams` of the first batch, of all rows that all processes read, so that all of them decide alike.
+    """`check_streams` on all rows of the first batch, so that all processes decide alike.
 
     Raises:
       ValueError: as `check_streams`; lean compilation on several devices, which would compile without it.
@@ -173,5 +173,5 @@ def check_whole_batch(
 
 @functools.cache
 def influence_program(fns: PolicyFns, length: int) -> Any:
-    """Compiled `stream_influence`, made once for all rewards and seeds; its parameters come back as they are."""
+    """Compiled `stream_influence`, made once for all rewards and seeds; it returns its parameters unchanged."""
     return jax.jit(lambda p, batch, frozen, key: (p, stream_influence(fns, p, batch, frozen.noise, key, length)))

@@ -1,7 +1,7 @@
 """Stage 2 from parameters to parameters: the settings of supervised fine-tuning, and the stage itself.
 
-`train_sft` trains end to end on clips, or the decoder alone on encoded contacts, at a fraction of the cost: after
-`train_encoder` has trained the encoders, that is what makes the answers say what they see.
+`train_sft` trains end to end on clips, or, at a fraction of the cost, only the decoder on encoded contacts, which
+teaches it to answer from the encoders that `train_encoder` has trained.
 """
 
 import dataclasses
@@ -38,11 +38,11 @@ class SFTConfig:
     questions: int = 2
     """Questions per contact and step; the contact is encoded once for all of them."""
     save_every: int = 100
-    """Steps between checkpoints, and between the points of which the best on validation objects is kept."""
+    """Steps between checkpoints; the best checkpoint on validation objects is kept."""
     micro_contacts: int = 2
     """Contacts of a micro-batch of the gradient; two stay in cache, which on a CPU is a third faster than sixteen."""
     max_logits: int = MAX_LOGITS
-    """Logits that may exist at once; more tokens than that are scored in blocks."""
+    """Logits that may exist at once; larger inputs are scored in blocks."""
     pack: int = 0
     """Tokens of a row that several questions with their answers share; 0 pads each to the longest instead."""
     remat: bool = False
@@ -91,17 +91,17 @@ def train_sft(
     decoder_only: bool = False,
     held_out: Callable[[Params], float] | None = None,
 ) -> Params:
-    """Train a policy on verified answers: its adapters where `policy.fns.lora` names any, and the towers without them.
+    """Train a policy on verified answers: adapters if `policy.fns.lora` names any, and the towers without adapters.
 
     Args:
       policy: its prompts, forward passes, and towers that no stage trains.
-      params: where it begins.
+      params: initial parameters.
       batches: `SFTBatch`es, for example of an `AnswerFeed`.
       config: steps, optimizer, memory.
       hooks: log, checkpoints, devices.
       seed: of fresh adapters.
       blind: train without touch.
-      decoder_only: train the decoder alone, on batches of encoded contacts.
+      decoder_only: train only the decoder, on batches of encoded contacts.
       held_out: score of parameters on validation objects, higher is better, taken at every checkpoint and logged; the
         parameters of the best checkpoint are returned.  Needs checkpoints that keep the best.
 
