@@ -102,7 +102,7 @@ SCOPE = (
 
 
 def recipes(root: Path = ROOT) -> str:
-    """A sentence that names the recipe of SFT of each recorded study."""
+    """Sentences that name the recipe of each recorded study."""
     studies: dict[str, list[str]] = {"paper": [], "touch": []}
     for name in dict.fromkeys(claim.experiment for claim in CLAIMS):
         config = (_recorded(name, root) or {}).get("config", {})
@@ -111,8 +111,9 @@ def recipes(root: Path = ROOT) -> str:
             studies[study.get("recipe", "paper")].append(f"`{name}`")
     by_recipe = {recipe: ", ".join(names) for recipe, names in studies.items()}
     return (
-        f"SFT is end to end, as published, in {by_recipe['paper'] or 'no run'}; in {by_recipe['touch'] or 'none'} "
-        "the encoders are trained first, with a linear head, then the decoder; these answer more questions right."
+        f"SFT is end to end, as published, in {by_recipe['paper'] or 'no run'}. In {by_recipe['touch'] or 'no run'} "
+        "the encoders are trained first, with a linear head, then the decoder; these answer more questions right, and "
+        "the objective of GRPO includes the likelihood of verified answers, which keeps it near SFT."
     )
 
 
