@@ -71,8 +71,9 @@ def test_rows_by_unsigned_lengths_share_one_value_and_pictures_in_0_to_1_need_no
     assert report.skipped == ()
     np.testing.assert_array_equal(np.concatenate([sequence.frames for (sequence,) in contacts]), RGB)
     labelled = layout | {"labels": {"hardness": {"path": "/hardness"}}}
-    (skip,) = list_hdf5(tmp_path, HDF5Config(map=write_map(tmp_path, labelled))).skipped
-    assert "hardness is " in skip.reason  # 1.5 is no level
+    skipped = list_hdf5(tmp_path, HDF5Config(map=write_map(tmp_path, labelled))).skipped
+    assert [skip.name for skip in skipped] == ["a.h5", "a.h5, row 1"]
+    assert "hardness is " in skipped[0].reason  # 1.5 is no level
 
 
 def test_groups_by_trial_with_force_of_another_rate(tmp_path):
