@@ -9,6 +9,7 @@ DIR/README.md           model card
 import contextlib
 import ctypes
 import dataclasses
+import errno
 import functools
 import glob
 import hashlib
@@ -153,7 +154,11 @@ def published(folder: Path, parts: Collection[str] = ()) -> Iterator[Path]:
         if not folder.exists() or not exchanged(unfinished, folder):
             if folder.exists():
                 folder.rename(old)
-            unfinished.rename(folder)
+            try:
+                unfinished.rename(folder)
+            except OSError as error:  # another process was faster: as if it had begun earlier
+                if error.errno not in (errno.ENOTEMPTY, errno.EEXIST) or not exchanged(unfinished, folder):
+                    raise
     except BaseException:
         if old.exists() and not folder.exists():
             old.rename(folder)
