@@ -2,7 +2,6 @@
 
 import importlib
 import io
-import os
 import pathlib
 import re
 import shutil
@@ -261,15 +260,3 @@ def test_progress_without_a_terminal_is_told_in_lines(monkeypatch):
         for done in (2, 3, 4, 5):
             progress(done, 5)
     assert told.getvalue() == "contacts: 3/5, 0.2/s, 10 s left\n"
-
-
-@pytest.mark.parametrize(("command", "status"), [("list --help", 0), ("list --helpx", 2)])
-def test_without_streams_nothing_is_raised_and_no_file_takes_their_numbers(tmp_path, command, status):
-    line = f"exec {sys.executable} -m sensors_io {command} >&-"
-    ended = subprocess.run(["sh", "-c", line], capture_output=True, text=True, check=False)
-    assert (ended.returncode, "Traceback" in ended.stderr) == (status, False)
-    code = "from sensors_io.commands.console import print_in_any_encoding as p; p(); print(open('x', 'w').fileno())"
-    line = f'exec {sys.executable} -c "{code}" <&- 2>&-'
-    env = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    ended = subprocess.run(["sh", "-c", line], capture_output=True, text=True, check=False, cwd=tmp_path, env=env)
-    assert int(ended.stdout) > 2
