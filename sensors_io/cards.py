@@ -2,7 +2,7 @@
 
 import os
 import pathlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 
 from sensors_io.codec import encode_card
 from sensors_io.contents import Cards, convert
@@ -12,7 +12,10 @@ from sensors_io.schema import ObjectCard, SchemaError
 from sensors_io.shards import ShardWriter, shard_file
 
 
-def replace_cards(path: str | os.PathLike[str], cards: Iterable[ObjectCard]) -> None:
+def replace_cards(
+    path: str | os.PathLike[str],
+    cards: Iterable[ObjectCard] | Callable[[Mapping[str, ObjectCard]], Iterable[ObjectCard]],
+) -> None:
     """Put cards in the place of those with the same ids; contacts stay as they are.
 
     One new shard holds the cards of all objects; the index that names it replaces the old one in one step, and only
@@ -20,7 +23,7 @@ def replace_cards(path: str | os.PathLike[str], cards: Iterable[ObjectCard]) -> 
 
     Args:
       path: directory of the records.
-      cards: the new ones.
+      cards: the new ones, or a function of the old ones, which no other process changes in the meantime.
 
     Raises:
       SchemaError: a card of an object that the records do not hold.
@@ -30,7 +33,8 @@ def replace_cards(path: str | os.PathLike[str], cards: Iterable[ObjectCard]) -> 
     Index.read(root)  # before a lock file is made where there are no records
     with write_lock(root):
         index = Index.read(root)
-        known, new = dict(Cards(root, index).items()), {card.object_id: card for card in cards}
+        known = dict(Cards(root, index).items())
+        new = {card.object_id: card for card in (cards(known) if callable(cards) else cards)}
         strange = sorted(set(new) - set(known))
         if strange:
             raise SchemaError(

@@ -21,7 +21,7 @@ _VALUE = re.compile(r": ?([0-9]{1,10})\s*\}")  # of the last key, if it is a who
 def write_json(path: pathlib.Path, tree: Mapping[str, Any]) -> None:
     """Replace a file by JSON in one step; its folder is made if need be, for what is written was measured."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")  # another process may write the same file
     with temporary.open("w", encoding="utf-8") as file:
         file.write(seal(json.dumps(tree, indent=1, allow_nan=False)))
         file.flush()

@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import io
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -41,7 +42,14 @@ OUT, ERR = _console(stderr=False), _console(stderr=True)
 
 
 def print_in_any_encoding() -> None:
-    """Let a terminal or a pipe that cannot show a letter show a question mark instead of ending the program."""
+    """Let a terminal or a pipe that cannot show a letter show a question mark instead of ending the program.
+
+    Streams that are closed lead nowhere: else the next file would take their number, and with it what libraries print.
+    """
+    while (spare := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(spare)
+    sys.stdout, sys.stderr = sys.stdout or os.fdopen(1, "w"), sys.stderr or os.fdopen(2, "w")
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a notebook's is another
             stream.reconfigure(errors="replace")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import pathlib
+from collections.abc import Iterable, Mapping
 
 import tyro
 
@@ -10,8 +11,9 @@ from sensors_io.cards import replace_cards
 from sensors_io.commands.console import OUT
 from sensors_io.importers.holdout import split_by_name
 from sensors_io.importers.keep import Shares
-from sensors_io.importers.label_table import ID, LabelsError, labelled, read_labels
+from sensors_io.importers.label_table import ID, LabelRow, LabelsError, labelled, read_labels
 from sensors_io.records import RecordStore
+from sensors_io.schema import ObjectCard
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -39,10 +41,13 @@ class Label(Shares):
                 f"{rows[strange[0]].place}: object_id is {strange[0]!r}: must be an object of {self.records}, which "
                 "`list` names; correct it"
             )
-        cards = {name: labelled(store.objects[name], row, self.annotator) for name, row in rows.items()}
+        replace_cards(self.records, lambda known: self._labelled(known, rows))
+        OUT.print(overview.object_table(RecordStore(self.records, allow_incomplete=True)))
+        return 0
+
+    def _labelled(self, known: Mapping[str, ObjectCard], rows: Mapping[str, LabelRow]) -> Iterable[ObjectCard]:
+        cards = {name: labelled(known[name], row, self.annotator) for name, row in rows.items()}
         new = [name for name, card in cards.items() if card.split == "unlabelled" and card.labels]
         for name, split in split_by_name(new, val_share=self.val_share, test_share=self.test_share).items():
             cards[name] = dataclasses.replace(cards[name], split=split)
-        replace_cards(self.records, cards.values())
-        OUT.print(overview.object_table(RecordStore(self.records, allow_incomplete=True)))
-        return 0
+        return cards.values()

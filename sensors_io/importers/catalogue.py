@@ -11,7 +11,9 @@ import dataclasses
 import hashlib
 import json
 import pathlib
-from collections.abc import Callable, Mapping
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from collections.abc import Sequence as Seq
 from typing import Any
 
@@ -240,6 +242,20 @@ def require_files(root: pathlib.Path, found: Seq[Any], expected: str) -> None:
     if not found:
         state = "holds none" if root.is_dir() else "is no directory"
         raise ImportSourceError(f"{root} {state}: expected {expected}; give the directory that holds them")
+
+
+def plain_names(texts: Iterable[str], otherwise: str) -> dict[str, str]:
+    """A name that a key may have for each text, another for each: a number follows where two would have the same."""
+    plain = {text: re.sub(r"[^A-Za-z0-9.\-]+", "_", text).strip("_.-") or otherwise for text in texts}
+    names = {text: text for text, name in plain.items() if text == name}
+    taken, counts = set(names), Counter[str]()
+    for text, name in plain.items():
+        new = name
+        while text not in names and new in taken:
+            counts[name] += 1
+            new = f"{name}_{counts[name] + 1}"
+        taken.add(names.setdefault(text, new))
+    return names
 
 
 def bare_catalogue(

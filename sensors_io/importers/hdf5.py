@@ -11,15 +11,27 @@ import dataclasses
 import fnmatch
 import functools
 import pathlib
+import posixpath
 import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
-from sensors_io.importers.catalogue import Catalogue, Listed, fingerprint, require_files
+from sensors_io.importers.catalogue import Catalogue, Listed, fingerprint, plain_names, require_files
 from sensors_io.importers.hdf5_map import ArrayMap, LayoutMap, ValueMap, read_map
-from sensors_io.importers.hdf5_read import HDF5Error, Place, bounds, dataset, h5py, named, opened, read_contact, spelled
+from sensors_io.importers.hdf5_read import (
+    HDF5Error,
+    Place,
+    bounds,
+    dataset,
+    h5py,
+    named,
+    opened,
+    read_contact,
+    spelled,
+    stated,
+)
 from sensors_io.importers.holdout import split_by_name
 from sensors_io.importers.keep import ImportConfig, ImportSourceError, Skip
 from sensors_io.schema import ATTRIBUTES, MATERIALS, ContactKey, ObjectCard, SchemaError
@@ -51,35 +63,42 @@ def list_hdf5(source: pathlib.Path, config: HDF5Config) -> Catalogue:
         raise ImportSourceError("map is None: must be the JSON file of a mapping; `--inspect` proposes one")
     layout = read_map(config.map)
     skipped: list[Skip] = []
+    found: list[tuple[Place, str, ContactKey, ObjectCard]] = []
     contacts: dict[ContactKey, Listed] = {}
     cards: dict[str, ObjectCard] = {}
     trials: dict[ContactKey, int] = {}  # the next one of those that a layout does not number
     unmapped: set[str] = set()
     for path in files:
+        facts = []
+        shown = path.name if path == source else path.relative_to(source).as_posix()
         try:
             with opened(path) as file:
-                places = list(contact_places(path, file, layout))
-                facts = [(place, _facts(file, place, layout, config.annotator)) for place in places]
-                unmapped.update(*(_unmapped(file, place, layout) for place in places[:1]))
+                places = list(contact_places(path, shown, file, layout))
+                for place in places:
+                    try:
+                        facts.append((place, *_facts(file, place, layout, config.annotator)))
+                    except HDF5Error as error:
+                        skipped.append(Skip(name=place.name, reason=str(error)))
+                unmapped.update(*(_unmapped(file, place, layout) for place, *_ in facts[:1]))
         except HDF5Error as error:
-            skipped.append(Skip(name=path.name, reason=str(error)))
+            skipped.append(Skip(name=shown, reason=str(error)))
             continue
-        if not facts:
-            skipped.append(Skip(name=path.name, reason=f"no group fits contact {layout.contact!r}; see `--inspect`"))
-        for place, found in facts:
-            if isinstance(found, HDF5Error):
-                skipped.append(Skip(name=place.name, reason=str(found)))
-                continue
-            key, card = found
-            if cards.setdefault(key.object_id, card) != card:
-                skipped.append(Skip(name=place.name, reason=f"labels object {key.object_id!r} unlike an earlier one"))
-                continue
-            stated = key
-            while key in contacts:
-                key = dataclasses.replace(stated, trial=max(trials.get(stated, 0), key.trial + 1))
-            trials[stated] = key.trial + 1
-            read = functools.partial(read_contact, place, key, layout, config)
-            contacts[key] = Listed(key=key, name=place.name, read=read)
+        if not places:
+            skipped.append(Skip(name=shown, reason=f"no group fits contact {layout.contact!r}; see `--inspect`"))
+        found += facts
+    names = plain_names((said for _, said, _, _ in found), "object")
+    for place, said, key, card in found:
+        key = dataclasses.replace(key, object_id=names[said])
+        card = dataclasses.replace(card, object_id=key.object_id)
+        if cards.setdefault(key.object_id, card) != card:
+            skipped.append(Skip(name=place.name, reason=f"labels object {key.object_id!r} unlike an earlier one"))
+            continue
+        unnumbered = key
+        while key in contacts:
+            key = dataclasses.replace(unnumbered, trial=max(trials.get(unnumbered, 0), key.trial + 1))
+        trials[unnumbered] = key.trial + 1
+        read = functools.partial(read_contact, place, key, layout, config)
+        contacts[key] = Listed(key=key, name=place.name, read=read)
     skipped += [Skip(name=name, reason="not in the mapping") for name in sorted(unmapped)]
     splits = split_by_name(cards, val_share=config.val_share, test_share=config.test_share)
     labelled = tuple(a for a in ATTRIBUTES if a in layout.labels)
@@ -108,20 +127,34 @@ def hdf5_files(source: pathlib.Path) -> list[pathlib.Path]:
     return files
 
 
-def contact_places(path: pathlib.Path, file: Any, layout: LayoutMap) -> Iterator[Place]:
-    """Contacts of a file, in the order of the numbers in the names of their groups."""
-    groups = ["/"]
-    file.visititems(lambda name, item: groups.append(f"/{named(name)}") if isinstance(item, h5py().Group) else None)
-    wanted = layout.contact if layout.contact.startswith("/") else f"/{layout.contact}"
-    depth = wanted.count("/")
-    fits = lambda name: (
-        name.count("/") == depth and fnmatch.fnmatchcase(name, wanted) and (name == "/") is (wanted == "/")
-    )
-    for group in sorted(filter(fits, groups), key=_by_number):
-        counts = {len(bounds(file, group, array.rows)) - 1 for array in _arrays(layout) if array.rows is not None}
+def contact_places(path: pathlib.Path, shown: str, file: Any, layout: LayoutMap) -> Iterator[Place]:
+    """Contacts of a file, in the order of the numbers in the names of their groups; one with two names counts once."""
+    groups: dict[Any, str] = {}
+    for at, group in sorted(_fitting(file, "", layout.contact.strip("/")), key=lambda found: _by_number(found[0])):
+        groups.setdefault(at if group is None else group, at)
+    for group in groups.values():
+        rows = [array.rows for array in _arrays(layout) if array.rows is not None] if file.get(group) else []
+        counts = {len(bounds(file, group, of)) - 1 for of in rows}
         if len(counts) > 1:
             raise HDF5Error(f"{group} states the rows of {' and of '.join(map(str, sorted(counts)))} contacts")
-        yield from (Place(file=path, group=group, row=row) for row in range(counts.pop() if counts else 1))
+        count = counts.pop() if counts else 1
+        yield from (Place(file=path, shown=shown, group=group, row=row, rows=count) for row in range(count))
+
+
+def _fitting(group: Any, at: str, pattern: str) -> Iterator[tuple[str, Any]]:
+    """Groups that fit a pattern, with their paths; links count as what they lead to, `None` where it is not there."""
+    wanted, _, below = pattern.partition("/")
+    if not wanted:
+        yield at or "/", group
+        return
+    for name in group:
+        if not fnmatch.fnmatchcase(named(name), wanted):
+            continue
+        item = group.get(name)
+        if item is None:
+            yield f"{at}/{name}", None
+        elif isinstance(item, h5py().Group):
+            yield from _fitting(item, f"{at}/{name}", below)
 
 
 def _arrays(layout: LayoutMap) -> Iterator[ArrayMap]:
@@ -144,20 +177,22 @@ def _unmapped(file: Any, place: Place, layout: LayoutMap) -> list[str]:
     return [name for name in found if f"{group}/{name}" not in used]
 
 
-def _facts(file: Any, place: Place, layout: LayoutMap, annotator: str) -> tuple[ContactKey, ObjectCard] | HDF5Error:
-    """Key and card of a contact, or what is wrong with them; the split is set later."""
+def _facts(file: Any, place: Place, layout: LayoutMap, annotator: str) -> tuple[str, ContactKey, ObjectCard]:
+    """Name of the object in the file, key and card of a contact; identity and split of the object are set later."""
+    if file.get(place.group) is None:
+        raise HDF5Error("is a broken link: put back what it leads to")
     value = lambda name, otherwise: (
         _stated(file, place, layout.values[name], name) if name in layout.values else otherwise
     )
     try:
-        object_id = _plain_name(str(value("object_id", place.name)))
+        said = str(value("object_id", place.name))
         whole = {name: _whole(value(name, 0), name) for name in ("site", "trial")}
-        key = ContactKey(object_id=object_id, motion=str(value("motion", "free")), **whole)
+        key = ContactKey(object_id="object", motion=str(value("motion", "free")), **whole)
         labels = {a: _level(a, _stated(file, place, of, a), of.names) for a, of in layout.labels.items()}
-        name = object_id.replace("_", " ")
-        return key, ObjectCard(object_id=object_id, split="train", labels=labels, annotator=annotator, name=name)
-    except (HDF5Error, SchemaError) as error:
-        return HDF5Error(str(error))
+        name = said.replace("_", " ")
+        return said, key, ObjectCard(object_id="object", split="train", labels=labels, annotator=annotator, name=name)
+    except SchemaError as error:
+        raise HDF5Error(str(error)) from error
 
 
 def _stated(file: Any, place: Place, of: ValueMap, name: str) -> Any:
@@ -165,25 +200,31 @@ def _stated(file: Any, place: Place, of: ValueMap, name: str) -> Any:
     if of.kind == "value":
         return of.value
     if of.kind == "attribute":
-        group = file[place.group]
-        while of.value not in group.attrs and group.name != "/":
-            group = group.parent
-        if of.value not in group.attrs:
+        at = place.group
+        while of.value not in file[at].attrs and at != "/":
+            at = posixpath.dirname(at)
+        if of.value not in file[at].attrs:
             raise HDF5Error(f"{place.group} and the groups above it lack the attribute {of.value!r} of {name}")
-        found = group.attrs[of.value]
+        found = stated(file[at], of.value)
     else:
-        found = dataset(file, place.group, of.value, name)[()]
-    found = np.asarray(found)
-    row = place.row if found.size > 1 else 0  # one value is that of all rows
-    if found.size <= row:
-        raise HDF5Error(f"{of.value} of {name} has no value for row {place.row}")
-    chosen = found.ravel()[row]
-    return chosen.decode(errors="replace") if isinstance(chosen, bytes) else chosen
+        found = stated(dataset(file, place.group, of.value, name))
+    flat = found.ravel()
+    if not flat.size:
+        raise HDF5Error(f"{of.value} of {name} holds no value")
+    if 1 < place.rows == flat.size == max(found.shape):
+        flat = flat[place.row :]
+    elif flat.size > 1 and (flat != flat[0]).any():
+        rows = f" or {place.rows}, one a row" if place.rows > 1 else ""
+        raise HDF5Error(f"{of.value} of {name} holds {flat.size} values that differ: must hold one{rows}")
+    value = flat[0].decode(errors="backslashreplace") if isinstance(flat[0], bytes) else flat[0]
+    if not isinstance(value, (str, int, float, np.number, np.bool_)):
+        raise HDF5Error(f"{of.value} of {name} is {value!r:.60}: must be a text or a number")
+    return value
 
 
 def _whole(value: Any, name: str) -> int:
     try:
-        whole = int(value)
+        whole = int("" if isinstance(value, (bool, np.bool_)) else value)
     except (TypeError, ValueError, OverflowError) as error:
         raise HDF5Error(f"{name} is {value!r:.60}: must be a whole number") from error
     if not isinstance(value, str) and whole != value:
@@ -199,11 +240,10 @@ def _level(attribute: str, value: Any, names: Mapping[str, int] | None) -> int:
         return names[said]
     if attribute == "material" and str(value) in MATERIALS:
         return MATERIALS.index(str(value))
-    return _whole(value, attribute)
-
-
-def _plain_name(text: str) -> str:
-    return re.sub(r"[^A-Za-z0-9.\-]+", "_", text).strip("_.-") or "object"
+    try:
+        return _whole(value, attribute)
+    except HDF5Error as error:
+        raise HDF5Error(f"{error}, or one of the mapping's `names`") from error
 
 
 def _by_number(name: str) -> list[tuple[int, int | str]]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from sensors_io.importers.hdf5_map import PLACEHOLDER, QUANTITIES, UNITS
-from sensors_io.importers.hdf5_read import SPELLED, STATED, HDF5Error, h5py, named, opened, spelled
+from sensors_io.importers.hdf5_read import SPELLED, STATED, HDF5Error, h5py, named, opened, spelled, stated
 from sensors_io.schema import ATTRIBUTES, LEVELS, MATERIALS, SENSORS
 
 DEEPEST = 3
@@ -64,7 +64,7 @@ def inspect(paths: Sequence[pathlib.Path]) -> tuple[list[str], dict[str, Any]]:
             with opened(path) as file:
                 draft = _draft(file)
                 alike = [other for other, of in drafts.items() if of.sensors == draft.sensors]
-                listed = () if alike else _lines(file, "  ")
+                listed = () if alike else _lines(file, "  ", {file["/"]: "/"})
                 lines += [f"{path.name}: the arrays of {alike[0].name}"] if alike else [path.name, *listed]
             drafts[path] = draft
         except HDF5Error as error:
@@ -135,9 +135,9 @@ def _label(attribute: str, file: Any, group: Any) -> tuple[Mapping[str, str], fr
 
     def gather(name: str, item: Any) -> None:
         if in_attributes and in_attributes[0] in item.attrs:
-            values.add(spelled(item.attrs[in_attributes[0]]))
-        elif not in_attributes and f"/{name}".endswith(f"/{in_arrays[0]}"):
-            values.update(spelled(x) for x in np.ravel(item[()]))
+            values.update(map(spelled, stated(item, in_attributes[0]).ravel()))
+        elif not in_attributes and f"/{name}".endswith(f"/{in_arrays[0]}") and isinstance(item, h5py().Dataset):
+            values.update(map(spelled, stated(item).ravel()))
 
     gather("", file)
     file.visititems(gather)
@@ -151,28 +151,36 @@ def _named(attribute: str, where: Mapping[str, str], values: set[str]) -> dict[s
     return dict(where) if values <= plain else {**where, "names": dict.fromkeys(sorted(values), PLACEHOLDER)}
 
 
-def _lines(group: Any, indent: str) -> Iterator[str]:
-    for name, value in group.attrs.items():
-        yield f"{indent}@{name} = {value!s:.60}"
+def _lines(group: Any, indent: str, listed: dict[Any, str]) -> Iterator[str]:
+    """Lines of a group; one that links lead to once more is not listed again."""
+    for name in group.attrs:
+        said = str(stated(group, name)) if group.attrs.get_id(name).shape is not None else ""
+        yield f"{indent}@{name} = {''.join(c if c.isprintable() else ' ' for c in said[:60])}"
     seen: dict[tuple[Any, ...], list[str]] = {}
     for name, item in group.items():
         named(name)
         if isinstance(item, h5py().Dataset):
-            stated = ", ".join(f"{a} {item.attrs[a]}" for a in STATED if a in item.attrs)
-            yield f"{indent}{name}  {item.dtype}{list(item.shape)}{f'  ({stated})' if stated else ''}"
+            units = ", ".join(f"{a} {item.attrs[a]}" for a in STATED if a in item.attrs)
+            shape = " without a value" if item.shape is None else list(item.shape)
+            yield f"{indent}{name}  {item.dtype}{shape}{f'  ({units})' if units else ''}"
             continue
         if not isinstance(item, h5py().Group):
             yield f"{indent}{name}  (broken link)" if item is None else f"{indent}{name}  (named type)"
             continue
-        alike = seen.setdefault(tuple((n, str(data.dtype), data.shape[1:]) for n, data in _datasets(item)), [])
+        if item in listed:
+            yield f"{indent}{name}/  (a link to {listed[item]})"
+            continue
+        listed[item] = item.name
+        about = tuple((n, str(data.dtype), data.shape and data.shape[1:]) for n, data in _datasets(item))
+        alike = seen.setdefault(about, [])
         alike.append(name)
         if len(alike) == 1:
             yield f"{indent}{name}/"
-            yield from _lines(item, indent + "  ")
+            yield from _lines(item, indent + "  ", listed)
     for first, *others in seen.values():
         if others:
-            listed = ", ".join(others[:SHOWN]) + (f" … {others[-1]}" if len(others) > SHOWN else "")
-            yield f"{indent}… with the arrays of {first}: {listed}"
+            names = ", ".join(others[:SHOWN]) + (f" … {others[-1]}" if len(others) > SHOWN else "")
+            yield f"{indent}… with the arrays of {first}: {names}"
 
 
 def _contents(group: Any) -> tuple[Any, ...]:
@@ -187,10 +195,13 @@ def _datasets(group: Any) -> Iterator[tuple[str, Any]]:
 
 def _contacts(file: Any) -> tuple[str, Any]:
     """Pattern of the groups that most often have the same contents, with something to see, and the first of them."""
-    levels: dict[int, list[Any]] = {0: [file]}
+    levels: dict[int, dict[Any, str]] = {0: {file["/"]: ""}}  # groups with their paths
     for depth in range(1, DEEPEST + 1):
-        inside = (item for parent in levels[depth - 1] for item in parent.values())
-        levels[depth] = [item for item in inside if isinstance(item, h5py().Group)]
+        levels[depth] = {}
+        for parent, at in levels[depth - 1].items():
+            for name, item in parent.items():
+                if isinstance(item, h5py().Group):
+                    levels[depth].setdefault(item, f"{at}/{name}")
     best: tuple[int, str, Any] = (0, "/", file)
     for depth, groups in levels.items():
         visible = [g for g in groups if any(_kind(n, d) in ("frames", "depth_mm") for n, d in _datasets(g))]
@@ -199,7 +210,7 @@ def _contacts(file: Any) -> tuple[str, Any]:
             contents, number = counts.most_common(1)[0]
             same = [g for g in visible if _contents(g) == contents]
             if number > best[0]:
-                parts = [g.name.strip("/").split("/") for g in same]
+                parts = [groups[g].strip("/").split("/") for g in same]
                 shared = [
                     next(iter(c)) if len(c) == 1 and depth > 1 else "*" for c in map(set, zip(*parts, strict=True))
                 ]

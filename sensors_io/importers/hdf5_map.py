@@ -30,6 +30,7 @@ trial that is free.
 import dataclasses
 import json
 import pathlib
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
@@ -154,7 +155,7 @@ def read_map(path: pathlib.Path) -> LayoutMap:
       ImportSourceError: no such file, no JSON, or an entry that does not fit; the message names it.
     """
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_distinct)
     except (OSError, ValueError, RecursionError) as error:
         raise ImportSourceError(f"{path} is no mapping: {error}; write one, as `--inspect` proposes") from error
     root = _Entry(found, path.name)
@@ -184,6 +185,14 @@ def read_map(path: pathlib.Path) -> LayoutMap:
         labels={name: _label(labels.part(name), name) for name in labels.found},
         sensors={name: _stream(sensors.part(name)) for name in sensors.found},
     )
+
+
+def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object; JSON would take the last of two values of one name, without a word."""
+    twice = next((name for name, count in Counter(name for name, _ in pairs).items() if count > 1), None)
+    if twice is not None:
+        raise ValueError(f"{twice!r} stands there twice in one object: keep one of them")
+    return dict(pairs)
 
 
 _VALUES = ("object_id", "site", "motion", "trial")
@@ -238,6 +247,8 @@ def _value(entry: _Entry, besides: str = "") -> ValueMap:
     kind, value = entry.one_of("attribute", "path", "value", besides=besides)
     if kind != "value":
         entry.text(kind)
+    elif not isinstance(value, (str, int, float)):
+        raise ImportSourceError(f"{entry.name}: value is {value!r:.60}: must be a text or a number; correct it")
     return ValueMap(kind=kind, value=value)
 
 

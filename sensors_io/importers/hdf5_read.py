@@ -21,9 +21,10 @@ STATED = ("unit", "units")
 
 SPELLED = {
     "meter": "m", "meters": "m", "metre": "m", "metres": "m", "millimeter": "mm", "millimeters": "mm",
-    "millimetre": "mm", "millimetres": "mm", "µm": "um", "micrometer": "um", "micrometers": "um", "newton": "N",
-    "newtons": "N", "n": "N", "nm": "N m", "n*m": "N m", "nmm": "N mm", "second": "s", "seconds": "s", "sec": "s",
-    "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns",
+    "millimetre": "mm", "millimetres": "mm", "µm": "um", "μm": "um", "micrometer": "um", "micrometers": "um",
+    "newton": "N", "newtons": "N", "n": "N", "nm": "N m", "n*m": "N m", "nmm": "N mm",
+    "second": "s", "seconds": "s", "sec": "s",
+    "milliseconds": "ms", "microseconds": "us", "µs": "us", "μs": "us", "nanoseconds": "ns",
 }  # fmt: skip
 """Other spellings of units, in lower case."""
 
@@ -40,24 +41,36 @@ class HDF5Error(UnreadableError):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Place:
-    """One contact: its file, its group, and its number among those whose rows the arrays hold one after the other."""
+    """One contact: its file, as reports show it, its group, and its number among the `rows` contacts of the group."""
 
     file: pathlib.Path
+    shown: str
     group: str
     row: int
+    rows: int
 
     @property
     def name(self) -> str:
         """For reports."""
-        return f"{self.file.name}{'' if self.group == '/' else self.group}" + (f", row {self.row}" if self.row else "")
+        return f"{self.shown}{'' if self.group == '/' else self.group}" + (f", row {self.row}" if self.row else "")
 
 
 def spelled(value: Any) -> str:
     """A value of a label as text; 1.0 is "1"."""
     if isinstance(value, bytes):
-        return value.decode(errors="replace")
+        return value.decode(errors="backslashreplace")
     whole = isinstance(value, (float, np.floating)) and float(value).is_integer()
     return str(int(value) if whole else value)
+
+
+def stated(of: Any, attribute: str | None = None) -> np.ndarray:
+    """The values of a data set, or of an attribute of a group; those of an enumeration are its words."""
+    kind = of.dtype if attribute is None else of.attrs.get_id(attribute).dtype
+    found = np.asarray(of[()] if attribute is None else of.attrs[attribute])
+    if (numbers := h5py().check_enum_dtype(kind)) is None:
+        return found
+    words = {number: word for word, number in numbers.items()}
+    return np.array([words.get(n, n) for n in found.ravel().tolist()], np.object_).reshape(found.shape)
 
 
 def h5py() -> ModuleType:
@@ -209,7 +222,7 @@ def _sequence(
         sensor,
         gap=np.diff(late[kept], prepend=late[kept][:1]) > 0,
         host_time_ns=times_ns[kept],
-        camera={"file": place.file.name, "group": place.group},
+        camera={"file": place.shown, "group": place.group},
         **{name: value[finite] for name, value in values.items()},
     )
     flags = sequence.flags | np.where(outside[finite], np.uint32(Flag.INCOMPLETE), np.uint32(0))
@@ -262,11 +275,12 @@ class _Rows:
         for name in STATED:
             if name not in self.data.attrs:
                 continue
-            said = self.data.attrs[name]
-            said = said.decode(errors="replace") if isinstance(said, bytes) else str(said)
-            unit = SPELLED.get(said.strip().lower(), said.strip())
-            if unit in units and units[unit] != array.factor:
-                raise HDF5Error(f"{array.path} states the unit {said!r}, the mapping {array.unit!r} for {self.what}")
+            for said in map(spelled, stated(self.data, name).ravel()):  # some programs state one for each component
+                unit = SPELLED.get(said.strip().lower(), said.strip())
+                if unit in units and units[unit] != array.factor:
+                    raise HDF5Error(
+                        f"{array.path} states the unit {said!r}, the mapping {array.unit!r} for {self.what}"
+                    )
 
     def _raw(self, positions: np.ndarray) -> np.ndarray:
         """Some rows, the axes in the order of the schema."""

@@ -12,14 +12,13 @@ file.  Clips tell no force and no motion, which is "free".
 import dataclasses
 import functools
 import pathlib
-import re
 from collections import Counter
 from collections.abc import Mapping
 from collections.abc import Sequence as Seq
 
 import numpy as np
 
-from sensors_io.importers.catalogue import Catalogue, Listed, Taken, fingerprint, require_files
+from sensors_io.importers.catalogue import Catalogue, Listed, Taken, fingerprint, plain_names, require_files
 from sensors_io.importers.holdout import split_by_name
 from sensors_io.importers.keep import LEAST_HZ, MOST_HZ, ImportConfig, ImportSourceError, Skip
 from sensors_io.importers.label_table import COLUMNS, ID, NAME, SPLIT, LabelRow, LabelsError, read_labels
@@ -83,12 +82,14 @@ def list_videos(source: pathlib.Path, config: VideosConfig) -> Catalogue:
     for name, row in rows.items():
         if row_of.setdefault(found := _find(name, row, by_name, source), row) is not row:
             raise LabelsError(f"{row.place}: {CLIP} {name!r} is {found}, as in {row_of[found].place}; keep one line")
-    cards = _cards(row_of, list(named), config)
+    names = plain_names(map(_plain, named), CLIP)
+    objects = {clip: _given(row_of.get(clip)) or names[_plain(clip)] for clip in named}  # as in mug_2 for mug/2.mp4
+    cards = _cards(row_of, objects, config)
     contacts, trials = [], Counter[str]()
     for name, path in named.items():
         if rows and name not in row_of:
             continue
-        object_id = _object_of(name, row_of.get(name))
+        object_id = objects[name]
         key = ContactKey(object_id=object_id, site=0, motion="free", trial=trials[object_id])
         trials[object_id] += 1
         contacts.append(Listed(key=key, name=name, read=functools.partial(_read, path, key, config)))
@@ -130,10 +131,9 @@ def _find(name: str, row: LabelRow, by_name: Mapping[str, Seq[str]], source: pat
     raise LabelsError(f"{row.place}: {CLIP} is {name!r}: {state}; give its path in the folder{near}")
 
 
-def _object_of(clip: str, row: LabelRow | None) -> str:
-    """The object of a clip: that of its row, else one named after its file, as in mug_2 for mug/2.mp4."""
-    given = "" if row is None else row.cells.get(ID, "")
-    return given or re.sub(r"[^A-Za-z0-9.\-]+", "_", _plain(clip)).strip("_.-") or CLIP
+def _given(row: LabelRow | None) -> str:
+    """The object that a row names."""
+    return "" if row is None else row.cells.get(ID, "")
 
 
 def _plain(clip: str) -> str:
@@ -142,12 +142,12 @@ def _plain(clip: str) -> str:
     return str(path.with_suffix("")) if path.suffix.lower() in SUFFIXES else clip
 
 
-def _cards(row_of: Mapping[str, LabelRow], named: Seq[str], config: VideosConfig) -> dict[str, ObjectCard]:
+def _cards(row_of: Mapping[str, LabelRow], objects: Mapping[str, str], config: VideosConfig) -> dict[str, ObjectCard]:
     """A card for each object, with what the rows of its clips say."""
     cards: dict[str, ObjectCard] = {}
-    for clip in row_of or named:
+    for clip in row_of or objects:
         row, unlabelled = row_of.get(clip), "unlabelled"
-        name = _object_of(clip, row)
+        name = objects[clip]
         try:
             card = ObjectCard(
                 object_id=name,

@@ -1,7 +1,9 @@
 """Signals that end a program do what Ctrl-C does; one that is ignored stays so; a second one ends it at once."""
 
 import gc
+import os
 import signal
+import subprocess
 import sys
 import time
 
@@ -96,3 +98,15 @@ def test_help_that_cannot_be_printed_is_one_line(monkeypatch, capsys):
     assert capsys.readouterr().err.startswith(
         "OSError: No space left on device: let standard output and standard error"
     )
+
+
+@pytest.mark.parametrize(("command", "status"), [("list --help", 0), ("list --helpx", 2)])
+def test_without_streams_nothing_is_raised_and_no_file_takes_their_numbers(tmp_path, command, status):
+    line = f"exec {sys.executable} -m sensors_io {command} >&-"
+    ended = subprocess.run(["sh", "-c", line], capture_output=True, text=True, check=False)
+    assert (ended.returncode, "Traceback" in ended.stderr) == (status, False)
+    code = "from sensors_io.commands.console import print_in_any_encoding as p; p(); print(open('x', 'w').fileno())"
+    line = f'exec {sys.executable} -c "{code}" <&- 2>&-'
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    ended = subprocess.run(["sh", "-c", line], capture_output=True, text=True, check=False, cwd=tmp_path, env=env)
+    assert int(ended.stdout) > 2

@@ -20,7 +20,7 @@ def write_lines(path: str | os.PathLike[str], trees: Iterable[Mapping[str, Any]]
 def write_text(path: pathlib.Path, text: str) -> None:
     """Replace a text file in one step; a folder that is missing is made."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")  # another process may write the same file
     with temporary.open("w", encoding="utf-8") as file:
         file.write(text)
         file.flush()

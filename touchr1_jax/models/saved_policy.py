@@ -9,6 +9,7 @@ DIR/README.md           model card
 import contextlib
 import ctypes
 import dataclasses
+import errno
 import functools
 import glob
 import hashlib
@@ -134,8 +135,7 @@ def published(folder: Path, parts: Collection[str] = ()) -> Iterator[Path]:
     may lie beside it under a hidden name, which `read_sealed` tells.  A link is followed.
 
     Args:
-      folder: where.
-      parts: names of what may be replaced; nothing else that somebody put there is.
+      folder: where; only `parts` of what is there, by their names, may be replaced.
 
     Raises:
       PolicyError: there is something else.
@@ -153,7 +153,11 @@ def published(folder: Path, parts: Collection[str] = ()) -> Iterator[Path]:
         if not folder.exists() or not exchanged(unfinished, folder):
             if folder.exists():
                 folder.rename(old)
-            unfinished.rename(folder)
+            try:
+                unfinished.rename(folder)
+            except OSError as error:  # not empty: another process was faster, as if it had begun earlier
+                if error.errno != errno.ENOTEMPTY or not exchanged(unfinished, folder):
+                    raise
     except BaseException:
         if old.exists() and not folder.exists():
             old.rename(folder)

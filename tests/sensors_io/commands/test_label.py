@@ -1,5 +1,6 @@
 """Recorded objects get their labels from a table: what it says and nothing else, all of it or nothing."""
 
+import dataclasses
 import pickle
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from sensors_io import cards, index
 from sensors_io.__main__ import main
 from sensors_io.cards import replace_cards
+from sensors_io.commands import label as labelling
 from sensors_io.records import RecordsError, RecordStore
 from sensors_io.schema import SchemaError
 from tests.sensors_io import fakes
@@ -122,3 +124,16 @@ def test_a_worker_that_opens_records_as_they_were_before_labels_says_so(root):
     store = pickle.dumps(RecordStore(root))
     next(root.glob("objects-*")).unlink()
     refused(RecordsError, "is missing: copy it again from its source", pickle.loads, store)
+
+
+def test_of_two_who_label_one_object_at_once_neither_loses_split_and_name(root, monkeypatch):
+    read = labelling.read_labels
+
+    def slow(*args):
+        replace_cards(root, [dataclasses.replace(bare(fakes.card(0)), split="test", name="a block")])
+        return read(*args)
+
+    monkeypatch.setattr(labelling, "read_labels", slow)
+    assert label(root, "object_id,roughness\nobject_0,1\n") == 0
+    card = RecordStore(root).objects["object_0"]
+    assert (card.labels, card.split, card.name) == ({"roughness": 1}, "test", "a block")

@@ -128,3 +128,10 @@ def test_a_clip_that_changed_at_the_same_size_is_not_mixed_in(clips, tmp_path):
     assert import_catalogue(listing(), out).contacts == 6
     changed.touch()
     refused(RecordsExistError, said, import_catalogue, listing(), out)
+
+
+def test_clips_whose_names_no_key_can_have_are_different_objects(tmp_path):
+    for name in ("杯", "碗", "mug 2", "mug_2"):
+        (tmp_path / f"{name}.mp4").touch()
+    found = [listed.key.object_id for listed in list_videos(tmp_path, VideosConfig(sensor="mini")).contacts]
+    assert sorted(found) == ["clip", "clip_2", "mug_2", "mug_2_2"]

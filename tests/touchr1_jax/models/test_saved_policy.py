@@ -320,3 +320,20 @@ def test_a_policy_that_is_replaced_while_it_is_read_is_read_again(tmp_path, monk
     monkeypatch.setattr(adapted_folder, "read_policy", Mock(side_effect=PolicyError("damaged")))
     with pytest.raises(PolicyError, match="damaged"):
         adapted_folder.read_saved(tmp_path / "policy")
+
+
+def test_two_who_publish_one_new_folder_at_once_leave_that_of_the_later(tmp_path, monkeypatch):
+    folder, exists, left = tmp_path / "policy", Path.exists, [1, 2]
+
+    def while_looked_for(path):
+        found = exists(path)
+        if path == folder and left and left.pop() == 1:  # between the last look and the renaming
+            folder.mkdir()
+            (folder / "who").write_text("the faster one")
+        return found
+
+    with published(folder, ["who"]) as mine:
+        (mine / "who").write_text("the slower one")
+        monkeypatch.setattr(Path, "exists", while_looked_for)
+    assert (folder / "who").read_text() == "the slower one"
+    assert [path.name for path in tmp_path.iterdir()] == ["policy"]
