@@ -85,7 +85,7 @@ def grpo_loss(
 
     Returns:
       The loss, and per prompt the averages that it is made of, the largest KL and grounding of a token, the share of
-      clipped tokens, and `mismatch_parts` of learner and sampler.
+      clipped tokens, `mismatch_parts` of learner and sampler, and whether any token counts, or was drawn.
     """
     algorithm, dropped = config.algorithm, too_far(config.algorithm, old - sampler, mask)
     longest = divisor(config, mask) if longest is None else longest
@@ -106,7 +106,8 @@ def grpo_loss(
         "grounding": grounding,
         "grounding_peak": peak(terms.grounding),
         "entropy": entropy,
-        "clip_share": group_mean(Average.ROLLOUT, clipped.astype(jnp.float32), mask, longest),
+        "clip_share": masked.mean_of_means(clipped.astype(jnp.float32), mask),
+        **{f"{n}_prompts": jnp.any(m, (-2, -1)).astype(jnp.float32) for n, m in (("kept", mask), ("drawn", drawn))},
         **mismatch_parts(jax.lax.stop_gradient(terms.log_prob) - sampler, drawn, dropped),
     }
 
@@ -303,7 +304,7 @@ def group_mean(kind: Average, x: Float[Array, "*p G T"], mask: Bool[Array, "*p G
     rollouts weigh more.  LENGTH: mean_i 1/N Σ_t x with the longest length N that is allowed (Dr. GRPO), so that no
     length is favoured.  BATCH: the same with the mean length of the batch's rollouts as N, so that the mean over the
     prompts is Σ x over all tokens of the batch by their number, as DAPO's code and TRL compute TOKEN: prompts with long
-    answers weigh more too.
+    answers weigh more too.  Rollouts that `mismatch_limit` drops are in N, as in TRL, and count as 0 but for TOKEN.
 
     Args:
       kind: which of them.
