@@ -84,8 +84,8 @@ def grpo_loss(
       head: log-probabilities of the sampler's most likely tokens, where scores are centered.
 
     Returns:
-      The loss, and per prompt the averages that it is made of, the largest KL and grounding of a token, the share of
-      clipped tokens, `mismatch_parts` of learner and sampler, and whether any token counts, or was drawn.
+      The loss, and per prompt its averages, the largest KL and grounding of a token, the share of clipped tokens, the
+      `mismatch_parts` of the learner, before any update if `old` is its, and whether any token counts, or was drawn.
     """
     algorithm, dropped = config.algorithm, too_far(config.algorithm, old - sampler, mask)
     longest = divisor(config, mask) if longest is None else longest
@@ -98,6 +98,7 @@ def grpo_loss(
     explored = algorithm.entropy_weight * at_most(entropy, algorithm.entropy_floor_nat)
     further = grounded - loss_beta(algorithm) * kl + explored + (0.0 if answer is None else algorithm.anchor * answer)
     gain = jnp.sum(weight * policy) + jnp.sum(further) / config.prompts
+    learner = old if ratio_to_learner(algorithm) else jax.lax.stop_gradient(terms.log_prob)
     peak = lambda x: jnp.max(jnp.where(mask, jax.lax.stop_gradient(x), 0.0), (-2, -1))
     return -gain, expected | {
         "surrogate": policy,
@@ -108,7 +109,7 @@ def grpo_loss(
         "entropy": entropy,
         "clip_share": masked.mean_of_means(clipped.astype(jnp.float32), mask),
         **{f"{n}_prompts": jnp.any(m, (-2, -1)).astype(jnp.float32) for n, m in (("kept", mask), ("drawn", drawn))},
-        **mismatch_parts(jax.lax.stop_gradient(terms.log_prob) - sampler, drawn, dropped),
+        **mismatch_parts(learner - sampler, drawn, dropped),
     }
 
 
@@ -267,8 +268,7 @@ def surrogate(
       advantage: one number for a whole rollout, or one for each token.
     """
     a = advantage if advantage.ndim == log_prob.ndim else advantage[..., None]
-    low, high = algorithm.clip_low, algorithm.clip_high
-    log_ratio = log_prob - old
+    low, high, log_ratio = algorithm.clip_low, algorithm.clip_high, log_prob - old
     if algorithm.surrogate is Surrogate.SEQUENCE:
         log_ratio = masked.mean(log_ratio, mask, -1, keepdims=True)
     ratio = jnp.broadcast_to(_ratio(log_ratio), log_prob.shape)
