@@ -84,8 +84,7 @@ def grpo_loss(
       head: log-probabilities of the sampler's most likely tokens, where scores are centered.
 
     Returns:
-      The loss, and per prompt its averages, the largest KL and grounding of a token, the share of clipped tokens, the
-      `mismatch_parts` of the learner, before any update if `old` is its, and whether any token counts, or was drawn.
+      The loss, and per prompt its averages, the peaks of a token, the share of clipped tokens, and `mismatch_parts`.
     """
     algorithm, dropped = config.algorithm, too_far(config.algorithm, old - sampler, mask)
     longest = divisor(config, mask) if longest is None else longest
@@ -108,7 +107,6 @@ def grpo_loss(
         "grounding_peak": peak(terms.grounding),
         "entropy": entropy,
         "clip_share": masked.mean_of_means(clipped.astype(jnp.float32), mask),
-        **{f"{n}_prompts": jnp.any(m, (-2, -1)).astype(jnp.float32) for n, m in (("kept", mask), ("drawn", drawn))},
         **mismatch_parts(learner - sampler, drawn, dropped),
     }
 
@@ -191,11 +189,13 @@ def too_far(algorithm: Algorithm, log_ratio: Float[Array, "*n T"], mask: Bool[Ar
 def mismatch_parts(
     gap: Float[Array, "P G T"], mask: Bool[Array, "P G T"], dropped: Bool[Array, "P G"]
 ) -> dict[str, Float[Array, "P"]]:
-    """Mean and largest |gap| of the drawn tokens of each prompt that count, and its share of dropped rollouts."""
+    """Of each prompt: mean and largest |gap| of its tokens, share of dropped rollouts, whether tokens stay or exist."""
     return {
         "sampler_gap": masked.mean_of_means(jnp.abs(gap), mask),
         "sampler_gap_peak": jnp.max(jnp.where(mask, jnp.abs(gap), 0.0), (-2, -1)),
         "dropped_share": jnp.mean(dropped, -1),
+        "kept_prompts": jnp.any(mask & ~dropped[..., None], (-2, -1)).astype(jnp.float32),
+        "drawn_prompts": jnp.any(mask, (-2, -1)).astype(jnp.float32),
     }
 
 
