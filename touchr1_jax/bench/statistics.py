@@ -112,7 +112,11 @@ def drawn_means(values: np.ndarray, cluster: np.ndarray, strata: np.ndarray, wei
       cluster: int [M], the number of each value's object.
       strata: int [M], see `metrics.Scores`.
       weights: int [resamples, C].
+
+    Raises:
+      ValueError: a value that is not finite, which would take its stratum out.
     """
+    _check_finite(values=values)
     means = []
     for s in np.unique(strata):
         at = strata == s
@@ -148,6 +152,7 @@ def interquartile_mean(scores: np.ndarray) -> float:
 
     Source: Agarwal et al., Deep RL at the Edge of the Statistical Precipice (2021), §4.3; rounding as in `rliable`.
     """
+    _check_finite(scores=scores)
     ordered = np.sort(scores, axis=None)
     cut = ordered.size // 4
     return float(ordered[cut : ordered.size - cut].mean())
@@ -163,12 +168,12 @@ def stratified_bootstrap_iqm(
 
     Source: Agarwal et al. (2021), §4.1 (stratified bootstrap).
     """
-    runs, tasks = scores.shape
+    middle, (runs, tasks) = interquartile_mean(scores), scores.shape
     pick = np.random.default_rng(seed).integers(runs, size=(resamples, runs, tasks))
     ordered = np.sort(scores[pick, np.arange(tasks)].reshape(resamples, -1), axis=1)
     cut = ordered.shape[1] // 4
     low, high = np.quantile(ordered[:, cut : ordered.shape[1] - cut].mean(axis=1), _tails(level))
-    return Interval(mean=interquartile_mean(scores), low=float(low), high=float(high))
+    return Interval(mean=middle, low=float(low), high=float(high))
 
 
 def probability_of_improvement(better: np.ndarray, than: np.ndarray) -> float:
@@ -181,6 +186,7 @@ def probability_of_improvement(better: np.ndarray, than: np.ndarray) -> float:
     """
     if better.shape[1:] != than.shape[1:]:
         raise ValueError(f"shapes are {better.shape} and {than.shape}: the tasks must be the same; align the columns")
+    _check_finite(better=better, than=than)
     x, y = better[:, None], than[None]
     return float(np.mean((x > y) + 0.5 * (x == y)))
 
@@ -217,6 +223,7 @@ def sign_flip_test(differences: np.ndarray, *, resamples: int = 20_000, seed: in
     n = len(differences)
     if n < 1:
         raise ValueError("differences is empty: a test needs one pair at least; compare more seeds")
+    _check_finite(differences=differences)
     exact = n <= EXACT_LIMIT
     if exact:
         signs = np.array(list(itertools.product((1.0, -1.0), repeat=n)))
@@ -340,9 +347,16 @@ def _check_values(values: np.ndarray, clusters: np.ndarray, strata: np.ndarray) 
     if not len(values) == len(clusters) == len(strata):
         lengths = f"{len(values)}, {len(clusters)} and {len(strata)}"
         raise ValueError(f"values, clusters and strata have lengths {lengths}: they must be equal; align the arrays")
-    if not np.all(np.isfinite(values)):
-        first = int(np.argmin(np.isfinite(values)))
-        raise ValueError(f"values[{first}] is {values[first]}: values must be finite; leave undefined ones out")
+    _check_finite(values=values)
+
+
+def _check_finite(**arrays: np.ndarray) -> None:
+    """Refuse NaN, of which every comparison is false: it would count as a loss, or as a hit that never comes."""
+    for name, values in arrays.items():
+        finite = np.isfinite(values).ravel()
+        if not finite.all():
+            first = int(np.argmin(finite))
+            raise ValueError(f"{name}[{first}] is {values.flat[first]}: must be finite; leave undefined ones out")
 
 
 def skill(error: np.ndarray, reference: np.ndarray, objects: np.ndarray, resamples: int = 2000) -> Interval:
@@ -353,8 +367,10 @@ def skill(error: np.ndarray, reference: np.ndarray, objects: np.ndarray, resampl
       objects: [n]; resamples of those alone whose reference has no error are left out.
 
     Raises:
-      ValueError: a reference without error, for which no skill is defined, or fewer than two objects.
+      ValueError: a reference without error, for which no skill is defined, a number that is not finite, or fewer than
+        two objects.
     """
+    _check_finite(error=error, reference=reference)
     if not reference.sum() > 0:
         raise ValueError(f"reference sums to {reference.sum()}: must be > 0, or no skill is defined; choose another")
     group, weights = draw_clusters(objects, resamples=resamples, seed=0)

@@ -57,8 +57,16 @@ def best_of(reward: Float[Array, "*p G"], k: int) -> Float[Array, "*p G"]:
     return jnp.take_along_axis(found, jnp.argsort(order, -1), -1)
 
 
+def neutralised(x: Float[Array, "D G"], finite: Bool[Array, "D"]) -> Float[Array, "D G"]:
+    """Numbers of rollouts; those of groups that are not finite are replaced by the mean of all others."""
+    return jnp.where(finite[:, None], x, masked.mean(x, jnp.broadcast_to(finite[:, None], x.shape)))
+
+
 def advantages(
-    algorithm: Algorithm, reward: Float[Array, "P G"], terms: Mapping[str, Float[Array, "P G"]]
+    algorithm: Algorithm,
+    reward: Float[Array, "P G"],
+    terms: Mapping[str, Float[Array, "P G"]],
+    finite: Bool[Array, "P"] | None = None,
 ) -> Float[Array, "P G"]:
     """Advantages by the algorithm's comparison; R̄ and σ are those of a group unless their name says otherwise.
 
@@ -72,8 +80,11 @@ def advantages(
       algorithm: which comparison, and ε.
       reward: total rewards, compared by the best of `algorithm.best_of`.
       terms: weighted rewards whose sum it is.
+      finite: groups that stay, for `of_kept_groups`; all by default.
     """
     epsilon, reward = algorithm.epsilon, best_of(reward, algorithm.best_of)
+    if finite is not None and algorithm.best_of > 1:  # the best of k has another mean over the batch than the reward
+        reward = neutralised(reward, finite)
     match algorithm.advantage:
         case Advantage.GROUP:
             return group_advantage(reward, epsilon=epsilon)

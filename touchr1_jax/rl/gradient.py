@@ -28,6 +28,9 @@ from touchr1_jax.types import Params, Rollout
 GROUNDING, PERTURBED = "grounding_stream_", "perturbed_stream_"
 """Metrics of each stream, followed by its number: mean G of the prompts in which it was perturbed, and their number."""
 
+COUNTED = {"entropy": "kept_prompts", "clip_share": "kept_prompts", "sampler_gap": "drawn_prompts"}
+"""Metrics that a prompt without tokens has no part in, and the number of the others."""
+
 
 class Experience(NamedTuple):
     """Rollouts and what an update needs to learn from them; every field has a leading P.
@@ -99,8 +102,7 @@ def grpo_gradient(
 
     zero = jax.tree.map(jnp.zeros_like, params)
     grads, (by_prompt, old) = jax.lax.scan(add_micro_batch, zero, batches_of(config.micro_prompts, experience))
-    over_prompts = lambda name: {"loss": jnp.sum}.get(name, jnp.max if name.endswith("_peak") else jnp.mean)
-    parts = {name: over_prompts(name)(value) for name, value in by_prompt.items()}
+    parts = _over_prompts(by_prompt)
     measured = {"kl": not left_out(loss_beta(algorithm)), "grounding": not left_out(algorithm.gamma)}
     parts = {name: x for name, x in parts.items() if measured.get(name.removesuffix("_peak"), True)}
     if measured["kl"]:
@@ -135,6 +137,14 @@ def log_probs(
     learn = Experience(batch, batch.features.touch, stream, rollout, rollout.log_prob, each, each[:, 0])
     of_micro_batch = lambda micro: experience_terms(fns, plain, params, params, micro).log_prob
     return in_order(jax.lax.map(of_micro_batch, batches_of(config.micro_prompts, learn)))
+
+
+def _over_prompts(by_prompt: Mapping[str, Array]) -> dict[str, Array]:
+    """Sum of the loss and of counts, largest peaks, means of all others; those of `COUNTED` over what they are of."""
+    sums = {"loss", *COUNTED.values()}
+    over = lambda name: jnp.sum if name in sums else jnp.max if name.endswith("_peak") else jnp.mean
+    means = {name: masked.mean(by_prompt[name], by_prompt[which] > 0) for name, which in COUNTED.items()}
+    return {name: over(name)(value) for name, value in by_prompt.items()} | means
 
 
 def _grounding_by_stream(grounding: Float[Array, "P"], experience: Experience) -> dict[str, Array]:

@@ -30,6 +30,7 @@ from touchr1_jax.rl.advantages import (
     added_after,
     advantages,
     dynamic_sampling_rows,
+    neutralised,
     no_signal,
     of_kept_groups,
     prompt_weights,
@@ -52,7 +53,6 @@ from touchr1_jax.rl.scoring import (
     ScoreFn,
     WeightedScore,
     left_out_groups,
-    neutralised,
     require_stable_rewards,
 )
 from touchr1_jax.rl.update import update_policy
@@ -307,7 +307,7 @@ class GRPOEngine:
         """Advantages and weights of the groups, with the perturbed touch of the grounding term."""
         algorithm, batch = self.config.algorithm, group.batch
         kept = functools.partial(of_kept_groups, algorithm, finite=group.finite)
-        advantage, by_token = kept(advantages(algorithm, group.reward, group.terms)), None
+        advantage, by_token = kept(advantages(algorithm, group.reward, group.terms, group.finite)), None
         if isinstance(self.score, WeightedScore) and algorithm.segment_credit:
             tokens = group.rollout.tokens
             by_token = kept(self.score.segment_advantages(algorithm, group.reward, group.terms, tokens))

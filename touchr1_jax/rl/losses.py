@@ -84,8 +84,7 @@ def grpo_loss(
       head: log-probabilities of the sampler's most likely tokens, if scores are centered.
 
     Returns:
-      The loss, and for each prompt its terms, the largest KL and grounding of a token, the share of clipped tokens, and
-      `mismatch_parts` of learner and sampler.
+      The loss, and per prompt its averages, the peaks of a token, the share of clipped tokens, and `mismatch_parts`.
     """
     algorithm, dropped = config.algorithm, too_far(config.algorithm, old - sampler, mask)
     longest = divisor(config, mask) if longest is None else longest
@@ -98,6 +97,7 @@ def grpo_loss(
     explored = algorithm.entropy_weight * at_most(entropy, algorithm.entropy_floor_nat)
     further = grounded - loss_beta(algorithm) * kl + explored + (0.0 if answer is None else algorithm.anchor * answer)
     gain = jnp.sum(weight * policy) + jnp.sum(further) / config.prompts
+    learner = old if ratio_to_learner(algorithm) else jax.lax.stop_gradient(terms.log_prob)
     peak = lambda x: jnp.max(jnp.where(mask, jax.lax.stop_gradient(x), 0.0), (-2, -1))
     return -gain, expected | {
         "surrogate": policy,
@@ -106,8 +106,8 @@ def grpo_loss(
         "grounding": grounding,
         "grounding_peak": peak(terms.grounding),
         "entropy": entropy,
-        "clip_share": group_mean(Average.ROLLOUT, clipped.astype(jnp.float32), mask, longest),
-        **mismatch_parts(jax.lax.stop_gradient(terms.log_prob) - sampler, drawn, dropped),
+        "clip_share": masked.mean_of_means(clipped.astype(jnp.float32), mask),
+        **mismatch_parts(learner - sampler, drawn, dropped),
     }
 
 
@@ -190,11 +190,13 @@ def too_far(algorithm: Algorithm, log_ratio: Float[Array, "*n T"], mask: Bool[Ar
 def mismatch_parts(
     gap: Float[Array, "P G T"], mask: Bool[Array, "P G T"], dropped: Bool[Array, "P G"]
 ) -> dict[str, Float[Array, "P"]]:
-    """Mean and largest |gap| of the tokens of each prompt that count, and the share of dropped rollouts."""
+    """Of each prompt: mean and largest |gap| of its tokens, share of dropped rollouts, whether tokens stay or exist."""
     return {
         "sampler_gap": masked.mean_of_means(jnp.abs(gap), mask),
         "sampler_gap_peak": jnp.max(jnp.where(mask, jnp.abs(gap), 0.0), (-2, -1)),
         "dropped_share": jnp.mean(dropped, -1),
+        "kept_prompts": jnp.any(mask & ~dropped[..., None], (-2, -1)).astype(jnp.float32),
+        "drawn_prompts": jnp.any(mask, (-2, -1)).astype(jnp.float32),
     }
 
 
@@ -267,8 +269,7 @@ def surrogate(
       advantage: one number for a whole rollout, or one for each token.
     """
     a = advantage if advantage.ndim == log_prob.ndim else advantage[..., None]
-    low, high = algorithm.clip_low, algorithm.clip_high
-    log_ratio = log_prob - old
+    low, high, log_ratio = algorithm.clip_low, algorithm.clip_high, log_prob - old
     if algorithm.surrogate is Surrogate.SEQUENCE:
         log_ratio = masked.mean(log_ratio, mask, -1, keepdims=True)
     ratio = jnp.broadcast_to(_ratio(log_ratio), log_prob.shape)
@@ -302,9 +303,9 @@ def group_mean(kind: Average, x: Float[Array, "*p G T"], mask: Bool[Array, "*p G
 
     ROLLOUT: mean_i 1/|o_i| Σ_t x (GRPO).  TOKEN: Σ_i Σ_t x / Σ_i |o_i| (DAPO, arXiv 2503.14476, eq. 8), so that long
     rollouts weigh more.  LENGTH: mean_i 1/N Σ_t x with the longest allowed length N (Dr. GRPO), so that no length is
-    favoured.  BATCH: the same with the mean length of the batch's rollouts as N, so that the mean over prompts is the
-    mean of x over all tokens of the batch, as DAPO's code and TRL compute TOKEN: prompts with long answers weigh more
-    too.
+    favoured.  BATCH: the same with the mean length of the batch's rollouts as N, so that the mean over prompts is that
+    over all tokens of the batch, as DAPO's code and TRL compute TOKEN.  Rollouts that `mismatch_limit` drops count in N,
+    and as 0 except for TOKEN.
 
     Args:
       kind: one of these.

@@ -8,11 +8,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from touchr1_jax import masked
 from touchr1_jax.rewards import STABLE, stable_weights
 from touchr1_jax.rewards.base import AnyReward, Decode, Reward, total_reward
 from touchr1_jax.rewards.proof import prove_rewards
-from touchr1_jax.rl.advantages import segment_advantages
+from touchr1_jax.rl.advantages import neutralised, segment_advantages
 from touchr1_jax.rl.config import Algorithm
 from touchr1_jax.text.language import SEGMENTS
 from touchr1_jax.text.parser import Parser
@@ -100,11 +99,6 @@ class WeightedScore:
         settled = {n: SEGMENTS.index(r.settled) for n, r in self.rewards.items() if isinstance(r, Reward)}
         segment = jax.vmap(jax.vmap(self.parser.segments))(tokens)
         return segment_advantages(algorithm, reward, terms, settled, segment)
-
-
-def neutralised(x: Float[Array, "D G"], finite: Bool[Array, "D"]) -> Float[Array, "D G"]:
-    """Numbers of rollouts; those of groups that are not finite are replaced by the mean of all others."""
-    return jnp.where(finite[:, None], x, masked.mean(x, jnp.broadcast_to(finite[:, None], x.shape)))
 
 
 def left_out_groups(

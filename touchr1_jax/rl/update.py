@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.rl.config import GRPOConfig, ratio_to_learner
-from touchr1_jax.rl.gradient import GROUNDING, PERTURBED, Experience, batches_of, grpo_gradient, log_probs
+from touchr1_jax.rl.gradient import COUNTED, GROUNDING, PERTURBED, Experience, batches_of, grpo_gradient, log_probs
 from touchr1_jax.rl.losses import divisor
 from touchr1_jax.rl.trust_region import within_trust
 from touchr1_jax.skipping import Skipping
@@ -73,21 +73,21 @@ def update_policy(
     steps = jnp.arange(number * count)
     places = ((steps == 0) & (number == 1), steps % number)
     (params, opt_state, _), all_parts = jax.lax.scan(once, start, places)
-    parts = over_minibatches({name: x[:number] for name, x in all_parts.items()})
-    return params, opt_state, parts | {"clip_share": jnp.mean(all_parts["clip_share"][-number:])}
+    of_pass = lambda steps: over_minibatches({name: x[steps] for name, x in all_parts.items()})
+    parts, last = of_pass(slice(number)), of_pass(slice(-number, None))
+    return params, opt_state, parts | {"clip_share": last["clip_share"]}
 
 
 def over_minibatches(parts: dict[str, Float[Array, "n"]]) -> dict[str, Float[Array, ""]]:
     """Metrics over all minibatches: the largest peak, sums of counts, means of all others.
 
-    The grounding of a stream is weighted by the number of prompts in which it was perturbed.
+    Those of `COUNTED`, and the grounding of a stream, are weighted by the number of prompts that they are of.
     """
     found = {name: (jnp.max if name.endswith("_peak") else jnp.mean)(x) for name, x in parts.items()}
-    for name, count in parts.items():
-        if name.startswith(PERTURBED):
-            mean = GROUNDING + name.removeprefix(PERTURBED)
-            found[name] = jnp.sum(count)
-            found[mean] = jnp.sum(count * parts[mean]) / jnp.maximum(found[name], 1.0)
+    streams = {GROUNDING + n.removeprefix(PERTURBED): n for n in parts if n.startswith(PERTURBED)}
+    for mean, name in (COUNTED | streams).items():
+        found[name] = jnp.sum(count := parts[name])
+        found[mean] = jnp.sum(count * parts[mean]) / jnp.maximum(found[name], 1.0)
     return found
 
 

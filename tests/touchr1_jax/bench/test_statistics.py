@@ -209,3 +209,23 @@ def test_resamples_of_objects_without_reference_error_are_left_out():
 )
 def test_an_interval_that_touches_zero_does_not_exclude_it(low, high, excludes):
     assert statistics.Interval(mean=(low + high) / 2, low=low, high=high).excludes_zero == excludes
+
+
+UNKNOWN = np.array([[1.0, 2.0], [3.0, np.nan]])
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: statistics.sign_flip_test(UNKNOWN.ravel()),  # was p = 0: no pattern is as large as NaN
+        lambda: statistics.interquartile_mean(UNKNOWN),  # was 2.5: NaN was dropped as the largest
+        lambda: statistics.stratified_bootstrap_iqm(UNKNOWN, resamples=2),
+        lambda: statistics.probability_of_improvement(UNKNOWN, UNKNOWN * 0),  # was a loss
+        lambda: statistics.improvement_interval(UNKNOWN * 0, UNKNOWN, resamples=2),
+        lambda: skill(UNKNOWN.ravel(), np.ones(4), np.arange(4)),
+        lambda: statistics.drawn_means(UNKNOWN.ravel(), np.arange(4), np.array([0, 0, 1, 1]), np.ones((2, 4), int)),
+    ],
+)
+def test_no_statistic_takes_nan_for_a_number(call):
+    with pytest.raises(ValueError, match=r"\[\d\] is nan: must be finite"):
+        call()

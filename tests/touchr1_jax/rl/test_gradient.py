@@ -136,6 +136,23 @@ def test_an_anchor_adds_the_likelihood_of_the_answers_and_its_gradient(experienc
 
 
 @pytest.mark.long
+def test_metrics_of_tokens_are_those_of_prompts_that_have_some(experience):
+    """The rollouts of the first prompt were cut off and are masked, those of the second are dropped."""
+    mask = experience.rollout.mask.at[0].set(False)
+    off = experience.rollout.log_prob.at[1].add(9.0)
+    some = experience._replace(rollout=experience.rollout.replace(mask=mask, log_prob=off))
+    config = dataclasses.replace(CONFIG, algorithm=dataclasses.replace(ALGORITHM, mismatch_limit=4.0))
+    _, whole, _ = gradient(config)(experience._replace(rollout=experience.rollout.replace(log_prob=off)))
+    _, parts, _ = gradient(config)(some)
+    alone = gradient(dataclasses.replace(config, prompts=1, micro_prompts=1))
+    each = [alone(jax.tree.map(lambda x, p=p: x[p : p + 1], some))[1] for p in range(P)]
+    assert (whole["kept_prompts"], whole["drawn_prompts"]) == (P - 1, P)
+    assert (parts["kept_prompts"], parts["drawn_prompts"]) == (P - 2, P - 1)
+    for name, first in (("entropy", 2), ("clip_share", 2), ("sampler_gap", 1)):
+        np.testing.assert_allclose(parts[name], np.mean([e[name] for e in each[first:]]), rtol=1e-5)
+
+
+@pytest.mark.long
 def test_stopped_branch_changes_the_gradient_but_no_value(one_stream):
     stopped = dataclasses.replace(CONFIG, algorithm=dataclasses.replace(ALGORITHM, grounding_stop_masked=True))
     (free, free_parts, _), (held, held_parts, _) = compute(one_stream, PARAMS), gradient(stopped)(one_stream)

@@ -84,16 +84,18 @@ def test_the_literal_bonus_of_a_group_that_is_left_out_is_the_mean_of_the_others
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("comparison", Advantage)
-def test_the_other_advantages_are_those_of_a_batch_without_the_group(comparison):
-    """Also where they are compared with σ of the whole batch."""
+@pytest.mark.parametrize(
+    ("comparison", "best_of"), [*((each, 1) for each in Advantage), (Advantage.GLOBAL, 2), (Advantage.BATCH, 2)]
+)
+def test_the_other_advantages_are_those_of_a_batch_without_the_group(comparison, best_of):
+    """Also where they are compared with mean and σ of the whole batch, and count by the best of two rollouts."""
     rng = np.random.default_rng(0)
     a, b = (jnp.asarray(rng.normal(size=(5, 4)), jnp.float32) for _ in range(2))
-    algorithm, kept = Paper(advantage=comparison, epsilon=1e-9), np.array([0, 1, 3, 4])
+    algorithm, kept = Paper(advantage=comparison, best_of=best_of, epsilon=1e-9), np.array([0, 1, 3, 4])
     alone = advantages(algorithm, (a + b)[kept], {"a": a[kept], "b": b[kept]})
     b = b.at[2, 1].set(jnp.nan)
     reward, terms, finite, _ = left_out_groups(a + b, {"a": a, "b": b})
-    found = of_kept_groups(algorithm, advantages(algorithm, reward, terms), finite)
+    found = of_kept_groups(algorithm, advantages(algorithm, reward, terms, finite), finite)
     np.testing.assert_allclose(found[kept], alone, rtol=1e-4)
     np.testing.assert_array_equal(found[2], np.zeros(4))
 

@@ -280,6 +280,8 @@ def test_minibatches_take_a_step_each_and_together_that_of_the_batch(learn):
     close(jax.tree.map(lambda x: np.asarray(x) / 2, both), whole, atol=0.01 * scale)
     assert parts["clip_share"] == 0
     assert far["clip_share"] > 0
+    # how far the sampler is off is no matter of how far the first half's step was
+    np.testing.assert_allclose(far["sampler_gap_peak"], parts["sampler_gap_peak"], rtol=1e-3)
 
 
 def test_a_mean_over_the_tokens_of_the_batch_weighs_prompts_by_them():
@@ -329,8 +331,16 @@ def test_the_learner_scores_what_was_sampled_as_the_sampler_did():
 
 
 def test_metrics_of_minibatches_count_prompts_and_weigh_streams_by_them():
-    """Stream 0 was perturbed in three prompts of the first half, with grounding .2, and in one of the second, .6."""
+    """Stream 0 was perturbed in three prompts of the first half, with grounding .2, and in one of the second, .6.
+
+    All rollouts of the second half were cut off and are masked, so that it has neither entropy nor clipped tokens.
+    """
     parts = {
+        "entropy": [0.5, 0.0],
+        "clip_share": [0.1, 0.0],
+        "kept_prompts": [2.0, 0.0],
+        "sampler_gap": [0.2, 0.3],
+        "drawn_prompts": [1.0, 3.0],
         "grounding_stream_0": [0.2, 0.6],
         "perturbed_stream_0": [3.0, 1.0],
         "loss": [1.0, 2.0],
@@ -339,6 +349,7 @@ def test_metrics_of_minibatches_count_prompts_and_weigh_streams_by_them():
     parts |= {"grounding_stream_1": [0.0, 0.0], "perturbed_stream_1": [0.0, 0.0]}
     found = over_minibatches({name: jnp.array(x) for name, x in parts.items()})
     hand = {"grounding_stream_0": 0.3, "perturbed_stream_0": 4, "grounding_stream_1": 0, "perturbed_stream_1": 0}
+    hand |= {"entropy": 0.5, "clip_share": 0.1, "kept_prompts": 2, "sampler_gap": 0.275, "drawn_prompts": 4}
     assert found == pytest.approx(hand | {"loss": 1.5, "kl_peak": 5})
 
 
