@@ -304,7 +304,7 @@ def group_mean(kind: Average, x: Float[Array, "*p G T"], mask: Bool[Array, "*p G
     ROLLOUT: mean_i 1/|o_i| Σ_t x (GRPO).  TOKEN: Σ_i Σ_t x / Σ_i |o_i| (DAPO, arXiv 2503.14476, eq. 8), so that long
     rollouts weigh more.  LENGTH: mean_i 1/N Σ_t x with the longest allowed length N (Dr. GRPO), so that no length is
     favoured.  BATCH: the same with the mean length of the batch's rollouts as N: in the mean over prompts, all tokens
-    of the batch weigh the same, as in DAPO's code and TRL.  A rollout that `mismatch_limit` drops counts in N with x = 0.
+    of the batch weigh the same, as in DAPO's code and TRL.  What `mismatch_limit` drops counts in N with x = 0.
 
     Args:
       kind: one of these.
