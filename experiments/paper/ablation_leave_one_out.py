@@ -8,11 +8,12 @@ GRPO starts from random parameters; without the accuracy reward, only consistenc
 replaces ordinal credit.  Seeds, questions and their order are the same.  The paper has only a cumulative ablation, so
 the report shows each effect with the corresponding step of that ablation.
 
-Cost: with five seeds, some 30 minutes of one core if `ablation_cumulative` has run, whose policies it shares,
-otherwise 70; `--scale smoke` under two.
+Cost: with five seeds, 32 minutes of one core if `ablation_cumulative` has run, whose policies it shares; otherwise
+some 70, not measured; `--scale smoke` under two.
 
-Expected: without SFT, every group earns nothing and the policy learns nothing (F7).  Without the accuracy reward, slots
-agree and are wrong (F2).  The effects of the other components are smaller than the differences between seeds.
+Expected: without SFT, every group earns nothing and the policy learns nothing (F7).  The effects of all other
+components are smaller than the differences between seeds, that of the accuracy reward too: the objective includes the
+likelihood of verified answers.  Under the published recipe, slots agree and are wrong without the accuracy reward (F2).
 """
 
 import dataclasses
