@@ -62,30 +62,10 @@ def list_hdf5(source: pathlib.Path, config: HDF5Config) -> Catalogue:
     if config.map is None:
         raise ImportSourceError("map is None: must be the JSON file of a mapping; `--inspect` proposes one")
     layout = read_map(config.map)
-    skipped: list[Skip] = []
-    found: list[tuple[Place, str, ContactKey, ObjectCard]] = []
+    found, skipped = _contacts(source, files, layout, config.annotator)
     contacts: dict[ContactKey, Listed] = {}
     cards: dict[str, ObjectCard] = {}
     trials: dict[ContactKey, int] = {}  # the next one of those that a layout does not number
-    unmapped: set[str] = set()
-    for path in files:
-        facts = []
-        shown = path.name if path == source else path.relative_to(source).as_posix()
-        try:
-            with opened(path) as file:
-                places = list(contact_places(path, shown, file, layout))
-                for place in places:
-                    try:
-                        facts.append((place, *_facts(file, place, layout, config.annotator)))
-                    except HDF5Error as error:
-                        skipped.append(Skip(name=place.name, reason=str(error)))
-                unmapped.update(*(_unmapped(file, place, layout) for place, *_ in facts[:1]))
-        except HDF5Error as error:
-            skipped.append(Skip(name=shown, reason=str(error)))
-            continue
-        if not places:
-            skipped.append(Skip(name=shown, reason=f"no group fits contact {layout.contact!r}; see `--inspect`"))
-        found += facts
     names = plain_names((said for _, said, _, _ in found), "object")
     for place, said, key, card in found:
         key = dataclasses.replace(key, object_id=names[said])
@@ -99,7 +79,6 @@ def list_hdf5(source: pathlib.Path, config: HDF5Config) -> Catalogue:
         trials[unnumbered] = key.trial + 1
         read = functools.partial(read_contact, place, key, layout, config)
         contacts[key] = Listed(key=key, name=place.name, read=read)
-    skipped += [Skip(name=name, reason="not in the mapping") for name in sorted(unmapped)]
     splits = split_by_name(cards, val_share=config.val_share, test_share=config.test_share)
     labelled = tuple(a for a in ATTRIBUTES if a in layout.labels)
     return Catalogue(
@@ -113,6 +92,38 @@ def list_hdf5(source: pathlib.Path, config: HDF5Config) -> Catalogue:
         config=dataclasses.asdict(config) | {"map": config.map.name},
         identity=fingerprint(source, files, dataclasses.replace(config, map=None), (config.map,)),
     )
+
+
+_Contact = tuple[Place, str, ContactKey, ObjectCard]
+"""Where a contact lies, the name of its object in the file, its key and card without the object's identity."""
+
+
+def _contacts(
+    source: pathlib.Path, files: list[pathlib.Path], layout: LayoutMap, annotator: str
+) -> tuple[list[_Contact], list[Skip]]:
+    """Contacts of all files, and what is wrong with others; arrays that the mapping leaves out are named too."""
+    found: list[_Contact] = []
+    skipped: list[Skip] = []
+    unmapped: set[str] = set()
+    for path in files:
+        of_file: list[_Contact] = []
+        shown = path.name if path == source else path.relative_to(source).as_posix()
+        try:
+            with opened(path) as file:
+                places = list(contact_places(path, shown, file, layout))
+                for place in places:
+                    try:
+                        of_file.append((place, *_facts(file, place, layout, annotator)))
+                    except HDF5Error as error:
+                        skipped.append(Skip(name=place.name, reason=str(error)))
+                unmapped.update(*(_unmapped(file, place, layout) for place, *_ in of_file[:1]))
+        except HDF5Error as error:
+            skipped.append(Skip(name=shown, reason=str(error)))
+            continue
+        if not places:
+            skipped.append(Skip(name=shown, reason=f"no group fits contact {layout.contact!r}; see `--inspect`"))
+        found += of_file
+    return found, [*skipped, *(Skip(name=name, reason="not in the mapping") for name in sorted(unmapped))]
 
 
 def hdf5_files(source: pathlib.Path) -> list[pathlib.Path]:
