@@ -66,7 +66,7 @@ def test_kinds_that_are_not_there_are_left_out(recordings, tmp_path, context):
     assert recorded_clips(tmp_path, 2, 4, context) == {}
     found = recorded_clips(recordings, 2, 4, context)
     assert {kind: [clip.shape for clip in clips] for kind, clips in found.items()} == {
-        IMPORTED: [(6, 120, 160, 3)] * 2,
+        IMPORTED: [(6, 24, 32, 3)] * 2,  # never enlarged
         WHOLE: [(4, 24, 32, 3)] * 2,
         STILLS: [(1, 24, 32, 3)] * 2,
     }
