@@ -18,7 +18,7 @@ from touchr1_jax.models.qwen.config_file import read_config
 from touchr1_jax.models.qwen.model import QwenVL
 from touchr1_jax.models.qwen.pictures import patchify
 from touchr1_jax.models.qwen.safetensors import read_header, read_tensor
-from touchr1_jax.models.qwen.weights import load_params, save_params
+from touchr1_jax.models.qwen.weights import load_params, row_of, save_params
 from touchr1_jax.text.chat import VISION, VISION_END, build_chat_layout, timestamps
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.text.template import QUESTIONS
@@ -66,7 +66,7 @@ def test_gradients_are_those_of_transformers(reference):
         return -jnp.mean(chosen)
 
     flat = flax.traverse_util.flatten_dict(jax.device_get(jax.jit(jax.grad(loss))(params)))
-    ours = {names.nested(s.key): names.write(flat[s.path], s) for s in names.sources(config).values()}
+    ours = {names.nested(s.key): names.write(row_of(flat, s), s) for s in names.sources(config).values()}
     theirs = {key.removeprefix("grad "): x for key, x in found.items() if key.startswith("grad ")}
     assert theirs.keys() == ours.keys()
     largest = max(np.abs(x).max() for x in theirs.values())
