@@ -10,7 +10,7 @@ meshes, and for adapters on a frozen base, memory is only counted; `--compiled N
 train in this layout, run a study with `--distributed --mesh.fsdp 8 --mesh.tensor 2`, in one process per GPU under
 Slurm, with `grpo.remat`, `grpo.bfloat16` and one prompt a micro-batch.
 
-Cost: a minute and a half of one core for each setup that `h200` compiles; `--scale smoke` half a minute.
+Cost: a minute and a half of one core for each setup that `h200` compiles; `--scale smoke` two and a half minutes.
 
 Expected: 43 of 141 GB on each device, 32 with adapters (`--compiled 2`); some 5 s per step at the assumed shares of
 peak, two thirds of it for the update, because sampling gathers the sharded weights once, not at every token.  The 32B

@@ -8,7 +8,7 @@ fails.  The library's own step trains small policies by SFT, then GRPO, in a sim
 before the runs (`experiments.engine.failures`).  The `stable` preset is trained at the same values.  Alarms are the
 same as in training.  Presets, bounds and parameters were chosen on seeds 100 to 109; seeds 0 to 9 are reported.
 
-Cost: 23 minutes in the recorded run on one core, less once everything is compiled; `--scale smoke` about one, most of
+Cost: 23 minutes in the recorded run on one core, less once everything is compiled; `--scale smoke` about two, most of
 it compilation.
 
 Expected: every failure can be provoked, and its alarm fires in nearly all failed runs.  `stable` never fails.
