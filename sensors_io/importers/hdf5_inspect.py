@@ -58,7 +58,6 @@ def inspect(paths: Sequence[pathlib.Path]) -> tuple[list[str], dict[str, Any]]:
     """
     lines: list[str] = []
     drafts: dict[pathlib.Path, _Draft] = {}
-    damaged: HDF5Error | None = None
     for path in paths:
         try:
             with opened(path) as file:
@@ -68,10 +67,9 @@ def inspect(paths: Sequence[pathlib.Path]) -> tuple[list[str], dict[str, Any]]:
                 lines += [f"{path.name}: the arrays of {alike[0].name}"] if alike else [path.name, *listed]
             drafts[path] = draft
         except HDF5Error as error:
-            damaged = HDF5Error(f"{path} {error}; fetch it again, or leave it out")
-            lines.append(str(damaged))
+            lines.append(f"{path} {error}; fetch it again, or leave it out")
     if not drafts:
-        raise damaged if damaged is not None else HDF5Error("there is no file")
+        raise HDF5Error(lines[-1])
     first, *others = drafts.values()
     same = [first, *(draft for draft in others if draft.sensors == first.sensors)]
     labels = {
