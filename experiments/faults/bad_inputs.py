@@ -143,16 +143,16 @@ def cases(unfinished: Path) -> tuple[BadInput, ...]:
 
 
 def typed() -> tuple[BadInput, ...]:
-    """Typing mistakes, values that contradict each other or make no sense, and a line that is no JSON."""
+    """Typing mistakes, values that contradict each other or make no sense, and a line that is not JSON."""
     line, values = (functools.partial(BadInput, kind) for kind in ("command line", "configuration"))
     study = "experiments ablation_ordinal"
     return (
-        line("an experiment that there is not", "experiments ablation_ordinl", "There is no experiment",
+        line("an unknown experiment", "experiments ablation_ordinl", "There is no experiment",
              "'ablation_ordinl'", "Did you mean ablation_ordinal"),
-        line("an option that there is not", f"{study} --grpo-stepz 3", "Unrecognized", "--grpo-stepz", "--grpo-steps"),
-        line("a number that is none", f"{study} --seeds many", "Error parsing", "--seeds", "INT"),
-        line("a scale that there is not", f"{study} --scale huge", "invalid choice", "'huge'", "smoke"),
-        line("a run that there is not", "experiments compare nothing nowhere --runs-dir {folder}", "FileNotFoundError",
+        line("an unknown option", f"{study} --grpo-stepz 3", "Unrecognized", "--grpo-stepz", "--grpo-steps"),
+        line("text in place of a number", f"{study} --seeds many", "Error parsing", "--seeds", "INT"),
+        line("an unknown scale", f"{study} --scale huge", "invalid choice", "'huge'", "smoke"),
+        line("an unknown run", "experiments compare nothing nowhere --runs-dir {folder}", "FileNotFoundError",
              "'nothing'", "must be a directory with config.json"),
         line("a label that no object has", "rewards explain --text soft --label hardness pink", "ExplainError",
              "'pink'", "correct the word"),
@@ -168,7 +168,7 @@ def typed() -> tuple[BadInput, ...]:
                "data_dir is None", "needs data_dir"),
         values("scenes without an object", "sensors_io generate --out {folder}/new --objects 0", "Value error",
                "objects", "must be"),
-        BadInput("answers", "a line that is no JSON", "bench score {folder}/questions.jsonl {folder}/answers.jsonl",
+        BadInput("answers", "a line that is not JSON", "bench score {folder}/questions.jsonl {folder}/answers.jsonl",
                  "LinesError", "line 1", "must be one JSON object", _text("questions.jsonl", '{"id": 1\n')),
     )  # fmt: skip
 
@@ -203,7 +203,7 @@ def records() -> tuple[BadInput, ...]:
         ),
         check("records whose writing has not ended", command, "IncompleteRecordsError", "records",
               "run its command again", functools.partial(write_records, complete=False)),
-        check("records of another making in the way", "sensors_io generate --out {folder}/records", "RecordsExistError",
+        check("records made with other settings", "sensors_io generate --out {folder}/records", "RecordsExistError",
               "made by config 'made up'", "choose another directory", write_records),
         check("a file where records should go", "sensors_io generate --out {folder}/taken", "RecordsExistError",
               "taken", "choose another path", _text("taken", "something else")),
@@ -216,11 +216,11 @@ def recordings() -> tuple[BadInput, ...]:
     extract = "sensors_io extract {folder}/%s --background {folder}/rest.png --out {folder}/out.npz --mm-per-px 0.06"
     tac3d = "sensors_io import tac3d {folder}/%s --out {folder}/new"
     return (
-        recorded("a picture that there is not", extract % "no.png", "Error", "no.png", "replace it", write_pictures),
-        recorded("a picture that is none", extract % "none.png", "Error", "none.png", "picture", write_pictures),
+        recorded("a missing picture", extract % "no.png", "Error", "no.png", "replace it", write_pictures),
+        recorded("a file that is not a picture", extract % "none.png", "Error", "none.png", "picture", write_pictures),
         recorded("sizes that differ", extract % "press.png", "Error", "(120, 160)", "crop them", write_pictures),
-        recorded("a folder to import that there is not", tac3d % "nowhere", source, "nowhere", "give"),
-        recorded("a folder to import that holds nothing", tac3d % "empty", source, "empty", "give",
+        recorded("a missing folder to import", tac3d % "nowhere", source, "nowhere", "give"),
+        recorded("an empty folder to import", tac3d % "empty", source, "empty", "give",
                  lambda folder: (folder / "empty").mkdir()),
     )  # fmt: skip
 

@@ -144,14 +144,15 @@ def attribute_table(estimates: Mapping[str, Mapping[str, Estimate]]) -> Table:
 
 
 def requirements(found: ComponentComparison) -> tuple[Requirement, ...]:
-    """The three signs that the paper rests on; none where a single seed leaves no interval."""
+    """The three signs that the paper rests on, by the ends of intervals; none where a single seed leaves none."""
     if not found.effects:
         return ()
     bounds = []
     if (ordinal := found.effect("ordinal", "omae")) is not None:
-        bounds.append(at_most("ordinal credit: change of OMAE", ordinal.seeds.mean, 0.0, note=str(ordinal)))
+        bounds.append(at_most("ordinal credit: change of OMAE, upper end", ordinal.seeds.high, 0.0, note=str(ordinal)))
     if (consistency := found.effect("consistency", "csc")) is not None:
-        bounds.append(at_least("consistency: change of CSC", consistency.seeds.mean, 0.0, note=str(consistency)))
+        name = "consistency: change of CSC, lower end"
+        bounds.append(at_least(name, consistency.seeds.low, 0.0, note=str(consistency)))
     largest = 0
     for metric in LADDER_METRICS:
         sizes = {e.step.arm: abs(e.seeds.mean) for e in found.effects if e.metric == metric}
@@ -176,7 +177,7 @@ def verdict(found: ComponentComparison) -> tuple[str, ...]:
         effect = found.effect(arm, metric)
         if effect is not None:
             reasons = found.failures.get(effect, ())
-            sentences.append(f"{subject}: {effect}" + (f". {'; '.join(reasons)}." if reasons else "."))
+            sentences.append(f"{subject}: {'; '.join((str(effect), *reasons))}.")
     count = collections.Counter(e.sign for e in found.effects)
     known = len(found.effects) - count["not in the paper"]
     sentences.append(

@@ -88,6 +88,7 @@ def run_ablation(ablation: Ablation, config: StudyConfig, context: Context) -> t
     presets = {
         f"preset of {arm}": preset_name(dataclasses.replace(config.grpo, algorithm=algorithm))
         for arm, algorithm in ablation.algorithms.items()
+        if algorithm != config.grpo.algorithm
     }
     trained_on = {
         f"rewards of {arm}": ", ".join(f"{name} {weight:g}" for name, weight in weights.items())

@@ -37,8 +37,8 @@ def against_control(rows: Mapping[str, Mapping[str, Estimate]], arms: Iterable[s
 
 
 def control_sentences(comparisons: Sequence[Comparison], arms: Iterable[str]) -> tuple[str, ...]:
-    """For each arm the metrics in which it is significantly better or worse than SFT continued."""
-    sentences = []
+    """The metrics in which an arm is significantly better or worse than SFT continued, and the arms without any."""
+    sentences, equal = [], []
     for arm in arms:
         of_arm = [c for c in comparisons if c.arm == arm and c.against == CONTINUED and c.over == "seeds"]
         if not of_arm:
@@ -46,10 +46,18 @@ def control_sentences(comparisons: Sequence[Comparison], arms: Iterable[str]) ->
         sure = [c for c in of_arm if c.low > 0 or c.high < 0]
         gains = [c for c in sure if (c.difference > 0) == (REPORTED[c.metric].better == "higher")]
         losses = [c for c in sure if c not in gains]
+        if not sure:
+            equal.append(arm)
+            continue
         better, worse = (", ".join(map(change, found)) or "no metric" for found in (gains, losses))
         sentences.append(
             f"Compared with SFT continued for the same time, {arm} is better in {better} and worse in {worse} "
             f"({len(of_arm)} metrics; intervals over seeds that exclude 0)."
+        )
+    if equal:
+        sentences.append(
+            f"Compared with SFT continued for the same time, no metric of {', '.join(equal)} differs: every interval "
+            "over seeds contains 0."
         )
     return tuple(sentences)
 

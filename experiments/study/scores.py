@@ -165,8 +165,9 @@ def study_results(study: Study, scored: Scored, **further: Any) -> Results:
 
 
 def study_settings(config: TrainingConfig) -> dict[str, str | float]:
-    """The preset of the engine, and the factors on the paper's learning rates."""
+    """The recipe of training, the preset of the engine, and the factors on the paper's learning rates."""
     return {
+        "recipe": config.recipe,
         "preset": preset_name(config.grpo),
         "lr_scale": config.grpo.lr_scale,
         "sft_lr_scale": config.sft.optimizer.lr_scale,

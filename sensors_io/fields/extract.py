@@ -61,7 +61,7 @@ class Extractor:
 
     Raises:
       CalibrationError: a calibration of another picture size or pitch.
-      SchemaError: a background that is no RGB picture or too small, a pitch that is none.
+      SchemaError: a background that is not an RGB picture or is too small; a pitch that is not positive.
     """
 
     def __init__(
