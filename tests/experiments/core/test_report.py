@@ -226,6 +226,12 @@ def test_pairs_of_a_metric_are_together_and_a_column_without_figures_is_left_out
     assert "Quantity" not in write(tmp_path, dataclasses.replace(results, data={"nested": {"a": 1}}))
 
 
+def test_a_table_of_more_than_fifty_rows_is_closed(tmp_path, results):
+    tables = [named_table("Levels", [{"arm": "a", "share": 0.5}] * n) for n in (50, 51)]
+    pages = [write(tmp_path, dataclasses.replace(results, tables=(table,))) for table in tables]
+    assert ["Table of 51 rows" in page for page in pages] == [False, True]
+
+
 def test_requirements_without_notes_have_no_column_for_them(tmp_path, results):
     noted = [dataclasses.replace(SLOW, note=note) for note in ("", "why")]
     pages = [write(tmp_path, dataclasses.replace(results, requirements=(one,))) for one in noted]

@@ -6,7 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from experiments.study.controls import RULES, decision_table
+from experiments.core.results import Comparison
+from experiments.study.controls import RULES, control_sentences, decision_table
+from experiments.study.study import CONTINUED
 from tests.experiments.study.test_study import TEST, answers_about
 
 
@@ -25,3 +27,15 @@ def test_a_certain_distribution_is_right_by_every_rule_and_a_silent_trace_two_le
         assert figures == ([100, 0, 100] if right else [0, 2, 0])
         assert middle == pytest.approx(100 * 6 / 14 if right else 0)  # of 14 ordinal labels six are the middle one
         assert expected == pytest.approx(100 * 6 / 14)
+
+
+def test_arms_without_a_difference_from_continued_sft_share_a_sentence():
+    def compared(arm, metric, low, high):
+        pair = {"metric": metric, "arm": arm, "against": CONTINUED}
+        return Comparison(**pair, difference=(low + high) / 2, ci95=(low, high), over="seeds", n=5)
+
+    rows = [compared("a", "acc", 0.1, 0.3), compared("a", "omae", 0.1, 0.3)]  # better in accuracy, worse in OMAE
+    rows += [compared(arm, "acc", -0.1, 0.3) for arm in ("b", "c")]
+    differs, equal = control_sentences(rows, ["b", "a", "c", "absent"])
+    assert differs.index("better in Acc") < differs.index("worse in OMAE")
+    assert "no metric of b, c differs" in equal
