@@ -333,11 +333,12 @@ def test_the_learner_scores_what_was_sampled_as_the_sampler_did():
 def test_metrics_of_minibatches_count_prompts_and_weigh_streams_by_them():
     """Stream 0 was perturbed in three prompts of the first half, with grounding .2, and in one of the second, .6.
 
-    All rollouts of the second half were cut off and are masked, so that it has neither entropy nor clipped tokens.
+    All rollouts of the second half were cut off and are masked, so that it has neither entropy, KL nor clipped tokens.
     """
     parts = {
         "entropy": [0.5, 0.0],
         "clip_share": [0.1, 0.0],
+        "kl": [0.4, 0.0],
         "kept_prompts": [2.0, 0.0],
         "sampler_gap": [0.2, 0.3],
         "drawn_prompts": [1.0, 3.0],
@@ -349,7 +350,7 @@ def test_metrics_of_minibatches_count_prompts_and_weigh_streams_by_them():
     parts |= {"grounding_stream_1": [0.0, 0.0], "perturbed_stream_1": [0.0, 0.0]}
     found = over_minibatches({name: jnp.array(x) for name, x in parts.items()})
     hand = {"grounding_stream_0": 0.3, "perturbed_stream_0": 4, "grounding_stream_1": 0, "perturbed_stream_1": 0}
-    hand |= {"entropy": 0.5, "clip_share": 0.1, "kept_prompts": 2, "sampler_gap": 0.275, "drawn_prompts": 4}
+    hand |= {"entropy": 0.5, "clip_share": 0.1, "kl": 0.4, "kept_prompts": 2, "sampler_gap": 0.275, "drawn_prompts": 4}
     assert found == pytest.approx(hand | {"loss": 1.5, "kl_peak": 5})
 
 
