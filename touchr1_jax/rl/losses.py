@@ -144,9 +144,9 @@ def policy_objective(
         return objective, clipped, {}
     expected = {"expected_reward": jnp.mean(exact.expected, -1)}
     if algorithm.learn_conclusion:
-        return conclude_exactly(objective, reached * exact.objective[..., None], levels.at), clipped, expected
+        return conclude_exactly(objective, reached * exact.objective[..., None], levels.at), clipped & trace, expected
     kept = jax.lax.stop_gradient(exact.objective)[..., None] - terms.reference_kl
-    return conclude_exactly(objective, kept, levels.at), clipped, expected
+    return conclude_exactly(objective, kept, levels.at), clipped & trace, expected
 
 
 def exact_levels(algorithm: Algorithm, terms: TokenTerms, levels: LevelRewards) -> ExactTerms:
