@@ -133,7 +133,8 @@ def segment_advantages(
 
     A reward that is known before a token does not depend on the token, so leaving it out keeps the policy gradient and
     reduces variance.  The published agreement of the slots is known at the end of `compare`, so the conclusion gets no
-    credit for it.  `advantages` compares each segment separately.
+    credit for it, nor blame where it repeats a tag, which makes the slots ⊥.  `advantages` compares each segment
+    separately.
 
     Args:
       algorithm, reward, terms: as for `advantages`.

@@ -111,7 +111,7 @@ def grpo_gradient(
     if measured["kl"]:
         parts["kl_cost_peak"] = loss_beta(algorithm) * parts["kl_peak"]
     if measured["grounding"]:
-        parts |= _grounding_by_stream(*map(in_order, (by_prompt["grounding"], by_prompt["kept_prompts"])), experience)
+        parts |= _grounding_by_stream(in_order(by_prompt["grounding"]), in_order(by_prompt["kept_prompts"]), experience)
     return grads, parts, in_order(old)
 
 
