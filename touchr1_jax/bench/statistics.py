@@ -166,9 +166,13 @@ def stratified_bootstrap_iqm(
     Args:
       scores: float [runs, tasks]; the tasks are the strata.
 
+    Raises:
+      ValueError: fewer than two runs.
+
     Source: Agarwal et al. (2021), §4.1 (stratified bootstrap).
     """
     middle, (runs, tasks) = interquartile_mean(scores), scores.shape
+    _check_runs(scores=scores)
     pick = np.random.default_rng(seed).integers(runs, size=(resamples, runs, tasks))
     ordered = np.sort(scores[pick, np.arange(tasks)].reshape(resamples, -1), axis=1)
     cut = ordered.shape[1] // 4
@@ -199,9 +203,13 @@ def improvement_interval(
     Args:
       better, than: float [runs, tasks] and [runs', tasks], as for `probability_of_improvement`.
 
+    Raises:
+      ValueError: as `probability_of_improvement`, or fewer than two runs on either side.
+
     Source: Agarwal et al. (2021), §4.1 and §4.3; the two sides are resampled separately, as in `rliable`.
     """
     point = probability_of_improvement(better, than)
+    _check_runs(better=better, than=than)
     rng, tasks = np.random.default_rng(seed), np.arange(better.shape[1])
     x, y = (a[rng.integers(0, len(a), (resamples, *a.shape)), tasks] for a in (better, than))
     x, y = x[:, :, None], y[:, None]
@@ -348,6 +356,13 @@ def _check_values(values: np.ndarray, clusters: np.ndarray, strata: np.ndarray) 
         lengths = f"{len(values)}, {len(clusters)} and {len(strata)}"
         raise ValueError(f"values, clusters and strata have lengths {lengths}: they must be equal; align the arrays")
     _check_finite(values=values)
+
+
+def _check_runs(**arrays: np.ndarray) -> None:
+    """Refuse a single run, whose resamples are all alike: its interval would have no width."""
+    for name, scores in arrays.items():
+        if len(scores) < 2:
+            raise ValueError(f"{name} holds {len(scores)} runs: an interval over runs needs two; train more seeds")
 
 
 def _check_finite(**arrays: np.ndarray) -> None:

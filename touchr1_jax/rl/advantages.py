@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from typing import assert_never
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -53,7 +54,9 @@ def best_of(reward: Float[Array, "*p G"], k: int) -> Float[Array, "*p G"]:
     share = np.triu(np.tile([0, *largest], (group, 1)), 1) + np.diag([math.comb(m, k - 1) for m in below])
     order = jnp.argsort(reward, -1)
     rising = jnp.take_along_axis(reward, order, -1)
-    found = rising @ jnp.asarray(share.T / math.comb(group - 1, k - 1), reward.dtype)
+    share = share.T / math.comb(group - 1, k - 1)
+    # at the precision of accelerators equal rewards would differ by more than `SPREAD_FLOOR`
+    found = jnp.matmul(rising, jnp.asarray(share, reward.dtype), precision=jax.lax.Precision.HIGHEST)
     return jnp.take_along_axis(found, jnp.argsort(order, -1), -1)
 
 
@@ -130,7 +133,8 @@ def segment_advantages(
 
     A reward that is known before a token does not depend on the token, so leaving it out keeps the policy gradient and
     reduces variance.  The published agreement of the slots is known at the end of `compare`, so the conclusion gets no
-    credit for it.  `advantages` compares each segment separately.
+    credit for it, nor blame where it repeats a tag, which makes the slots ⊥.  `advantages` compares each segment
+    separately.
 
     Args:
       algorithm, reward, terms: as for `advantages`.
@@ -157,10 +161,16 @@ def group_advantage(
       epsilon: added to σ.
       normalise: false leaves σ out (Dr. GRPO, arXiv 2503.20783).
     """
-    centred = reward - jnp.mean(reward, -1, keepdims=True)
+    found = centred(reward)
     if normalise:
-        centred = centred / (jnp.std(reward, -1, keepdims=True) + epsilon)
-    return jnp.where(zero_variance(reward)[..., None], 0.0, centred)
+        found = found / (jnp.std(found, -1, keepdims=True) + epsilon)
+    return jnp.where(zero_variance(reward)[..., None], 0.0, found)
+
+
+def centred(reward: Float[Array, "*p G"]) -> Float[Array, "*p G"]:
+    """R_i − R̄, by differences within the group, because the mean of rewards far from 0 rounds as they do."""
+    near = reward - reward[..., :1]
+    return near - jnp.mean(near, -1, keepdims=True)
 
 
 def batch_advantage(reward: Float[Array, "P G"], *, epsilon: float = 1e-4) -> Float[Array, "P G"]:
@@ -177,9 +187,8 @@ def batch_advantage(reward: Float[Array, "P G"], *, epsilon: float = 1e-4) -> Fl
       epsilon: added to σ.
     """
     equal = zero_variance(reward)
-    sigma = jnp.sqrt(masked.mean(jnp.var(reward, -1), ~equal))
-    centred = reward - jnp.mean(reward, -1, keepdims=True)
-    return jnp.where(equal[:, None], 0.0, centred / (sigma + epsilon))
+    sigma = jnp.sqrt(masked.mean(jnp.var(centred(reward), -1), ~equal))
+    return jnp.where(equal[:, None], 0.0, centred(reward) / (sigma + epsilon))
 
 
 def added_after(bonus: Float[Array, "*p G"], weight: float) -> Float[Array, "*p G"]:

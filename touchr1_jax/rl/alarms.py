@@ -69,10 +69,9 @@ class AlarmRule:
 
 
 def middle_excess(now: Metrics, start: Metrics) -> float | None:
-    """F1: share of middle answers above the share of middle labels."""
+    """F1: share of middle answers above the share of middle labels, whatever the number of levels."""
     del start
-    labels = [now[f"labels_level_{k}"] for k in range(3)]
-    return None if not sum(labels) else now["middle_rate"] - labels[1] / sum(labels)
+    return now["middle_rate"] - now["middle_labels"]
 
 
 def echo_excess(now: Metrics, start: Metrics) -> float | None:

@@ -112,7 +112,7 @@ class Algorithm:
     """Weight of the KL to the reference."""
     kl: KLEstimator = "k3"
     kl_in_reward: bool = False
-    """Subtract β Σ_t log(π/π_ref) from the reward of a rollout, instead of β KL from the objective."""
+    """Subtract β Σ_t log(π/π_ref) from a rollout's reward, not β KL from J; among equal answers, σ magnifies it."""
     reference_every: int | None = None
     """Steps after which the policy becomes its own reference; `None` keeps the first reference."""
     reference_share: float = 1.0

@@ -57,14 +57,15 @@ def swap_touch(features: Features, key: Array) -> Perturbed:
     """Replace touch by that of another prompt of the batch, at a random distance 1 … P − 1; never its own.
 
     Swapped touch has all statistics of touch, so a policy that only detects noise does not pass this control.  Only
-    streams that both prompts have are exchanged.
+    streams that both prompts have are exchanged.  The control does not apply where the other prompt is about the same
+    contact, whose touch is no other.
     """
     p = features.stream_mask.shape[0]
     other = (jnp.arange(p) + jax.random.randint(key, (), 1, max(p, 2))) % p
     both = features.stream_mask & features.stream_mask[other]
     take = lambda x: jnp.where(both.reshape(*both.shape, *(1,) * (x.ndim - 2)), x[other], x)
     changed = dataclasses.replace(features, touch=take(features.touch), touch_time=take(features.touch_time))
-    return Perturbed(changed, jnp.any(both, -1) & (p > 1))
+    return Perturbed(changed, jnp.any(changed.touch != features.touch, (1, 2, 3)))
 
 
 def mask_one_stream(

@@ -28,7 +28,10 @@ from touchr1_jax.types import Params, Rollout
 GROUNDING, PERTURBED = "grounding_stream_", "perturbed_stream_"
 """Metrics of each stream, followed by its number: mean G of the prompts in which it was perturbed, and their number."""
 
-COUNTED = {"entropy": "kept_prompts", "clip_share": "kept_prompts", "sampler_gap": "drawn_prompts"}
+COUNTED = {
+    **dict.fromkeys(("kl", "grounding", "entropy", "clip_share"), "kept_prompts"),
+    "sampler_gap": "drawn_prompts",
+}
 """Metrics that a prompt without tokens has no part in, and the number of the others."""
 
 
@@ -108,7 +111,7 @@ def grpo_gradient(
     if measured["kl"]:
         parts["kl_cost_peak"] = loss_beta(algorithm) * parts["kl_peak"]
     if measured["grounding"]:
-        parts |= _grounding_by_stream(in_order(by_prompt["grounding"]), experience)
+        parts |= _grounding_by_stream(in_order(by_prompt["grounding"]), in_order(by_prompt["kept_prompts"]), experience)
     return grads, parts, in_order(old)
 
 
@@ -147,12 +150,14 @@ def _over_prompts(by_prompt: Mapping[str, Array]) -> dict[str, Array]:
     return {name: over(name)(value) for name, value in by_prompt.items()} | means
 
 
-def _grounding_by_stream(grounding: Float[Array, "P"], experience: Experience) -> dict[str, Array]:
-    """Mean G of the prompts in which each stream was perturbed, and how many they were."""
+def _grounding_by_stream(
+    grounding: Float[Array, "P"], kept: Float[Array, "P"], experience: Experience
+) -> dict[str, Array]:
+    """Mean G of the kept prompts in which each stream was perturbed, and how many they were."""
     streams = experience.batch.features.stream_mask
     found = {}
     for s in range(streams.shape[1]):
-        perturbed = (experience.masked_stream == s) & streams[:, s]
+        perturbed = (experience.masked_stream == s) & streams[:, s] & (kept > 0)
         found[f"{GROUNDING}{s}"] = masked.mean(grounding, perturbed)
         found[f"{PERTURBED}{s}"] = jnp.sum(perturbed).astype(jnp.float32)
     return found

@@ -218,7 +218,7 @@ class GRPOEngine:
             rows = dynamic_sampling_rows(self.no_signal(group), self.config.prompts)
             group = jax.tree.map(lambda x: x[rows], group)
         reference = frozen.reference if state.reference is None else state.reference
-        group = self.penalised(group, reference) if self.config.algorithm.kl_in_reward else group
+        group = self.penalised(group, sampler, reference) if self.config.algorithm.kl_in_reward else group
         learn = self.experience(group, self.perturbed(group.batch, frozen, mask_key))
         if not ratio_to_learner(self.config.algorithm):  # by the learner's pass: the sampler's own may round otherwise
             learn = learn._replace(old=log_probs(self.fns, self.config, sampler, group.batch, learn.rollout))
@@ -286,14 +286,17 @@ class GRPOEngine:
             equal &= zero_variance(group.bonus)
         return equal | ~group.finite
 
-    def penalised(self, group: Group, reference: Params) -> Group:
+    def penalised(self, group: Group, sampler: Params, reference: Params) -> Group:
         """The group with −β Σ_t log(π/π_ref) as a further term of its reward: the unbiased estimate k1 of the KL.
 
-        Groups that are left out, also for this term, again have the mean of all others.
+        Both are of the learner's pass where the sampler rounds otherwise: σ would make an advantage of the difference
+        among equal answers.  Groups that are left out, also for this term, again have the mean of all others.
         """
-        rollout = group.rollout
-        log_ref = log_probs(self.fns, self.config, reference, group.batch, rollout)
-        term = -self.config.algorithm.beta * masked.total(rollout.log_prob - log_ref, rollout.mask, -1)
+        rollout, own = group.rollout, group.rollout.log_prob
+        passed = functools.partial(log_probs, self.fns, self.config, batch=group.batch, rollout=rollout)
+        if self.config.bfloat16 or group.batch.rollout is not None:
+            own = passed(sampler)
+        term = -self.config.algorithm.beta * masked.total(own - passed(reference), rollout.mask, -1)
         finite = group.finite & jnp.all(jnp.isfinite(term), -1)
         neutral = functools.partial(neutralised, finite=finite)
         reward, terms = jax.tree.map(neutral, (group.reward + term, {**group.terms, "kl": term}))

@@ -84,7 +84,7 @@ def grpo_loss(
       head: log-probabilities of the sampler's most likely tokens, if scores are centered.
 
     Returns:
-      The loss, and per prompt its averages, the peaks of a token, the share of clipped tokens, and `mismatch_parts`.
+      The loss, and per prompt: S as averaged, means over kept rollouts, peaks of a token, and `mismatch_parts`.
     """
     algorithm, dropped = config.algorithm, too_far(config.algorithm, old - sampler, mask)
     longest = divisor(config, mask) if longest is None else longest
@@ -101,9 +101,9 @@ def grpo_loss(
     peak = lambda x: jnp.max(jnp.where(mask, jax.lax.stop_gradient(x), 0.0), (-2, -1))
     return -gain, expected | {
         "surrogate": policy,
-        "kl": kl,
+        "kl": masked.mean_of_means(terms.reference_kl, mask),
         "kl_peak": peak(terms.reference_kl),
-        "grounding": grounding,
+        "grounding": masked.mean_of_means(terms.grounding, mask),
         "grounding_peak": peak(terms.grounding),
         "entropy": entropy,
         "clip_share": masked.mean_of_means(clipped.astype(jnp.float32), mask),
@@ -144,9 +144,9 @@ def policy_objective(
         return objective, clipped, {}
     expected = {"expected_reward": jnp.mean(exact.expected, -1)}
     if algorithm.learn_conclusion:
-        return conclude_exactly(objective, reached * exact.objective[..., None], levels.at), clipped, expected
+        return conclude_exactly(objective, reached * exact.objective[..., None], levels.at), clipped & trace, expected
     kept = jax.lax.stop_gradient(exact.objective)[..., None] - terms.reference_kl
-    return conclude_exactly(objective, kept, levels.at), clipped, expected
+    return conclude_exactly(objective, kept, levels.at), clipped & trace, expected
 
 
 def exact_levels(algorithm: Algorithm, terms: TokenTerms, levels: LevelRewards) -> ExactTerms:
@@ -304,7 +304,7 @@ def group_mean(kind: Average, x: Float[Array, "*p G T"], mask: Bool[Array, "*p G
     ROLLOUT: mean_i 1/|o_i| Σ_t x (GRPO).  TOKEN: Σ_i Σ_t x / Σ_i |o_i| (DAPO, arXiv 2503.14476, eq. 8), so that long
     rollouts weigh more.  LENGTH: mean_i 1/N Σ_t x with the longest allowed length N (Dr. GRPO), so that no length is
     favoured.  BATCH: the same with the mean length of the batch's rollouts as N: in the mean over prompts, all tokens
-    of the batch weigh the same, as in DAPO's code and TRL.  What `mismatch_limit` drops counts in N with x = 0.
+    of the batch weigh the same, as in DAPO's code.  What `mismatch_limit` drops counts in N, as in TRL (not in verl).
 
     Args:
       kind: one of these.

@@ -14,17 +14,18 @@ from touchr1_jax.types import Parsed, Rollout, Target
 def rollout_metrics(
     rollout: Rollout, reward: Float[Array, "P G"], no_signal: Bool[Array, "P"], parsed: Parsed, target: Target
 ) -> dict[str, Array]:
-    """Means over all rollouts; `middle_rate` over ordinal questions, `agreement` over formatted answers."""
+    """Means over all rollouts; `middle_rate` and `middle_labels` over questions whose levels have a middle one."""
     asked = target.asked[:, None]
     label, middle = target.label[:, None], (target.levels[:, None] - 1) // 2
-    ordinal = asked & target.ordinal[:, None]
+    has_middle = asked & (target.ordinal & (target.levels % 2 == 1))[:, None]
     right = (parsed.conclude == label) & (label >= 0)
     return {
         "reward": jnp.mean(reward),
         "reward_std": jnp.mean(jnp.std(reward, -1)),
         "degenerate_share": jnp.mean(no_signal),
         "accuracy": masked.mean(right, jnp.broadcast_to(asked, right.shape)),
-        "middle_rate": masked.mean(parsed.conclude == middle, jnp.broadcast_to(ordinal, right.shape)),
+        "middle_rate": masked.mean(parsed.conclude == middle, jnp.broadcast_to(has_middle, right.shape)),
+        "middle_labels": masked.mean(label == middle, has_middle),
         "parse_rate": jnp.mean(parsed.formatted & jnp.all((parsed.conclude >= 0) | ~asked, -1)),
         "truncated_share": jnp.mean(parsed.truncated),
         "length": jnp.mean(jnp.sum(rollout.mask, -1)),

@@ -22,6 +22,7 @@ from touchr1_jax.models.stacked import layer_by_layer
 from touchr1_jax.rl.losses import token_log_probs
 from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.types import Params, Parsed, Rollout, Target
+from touchr1_jax.validation import above, within
 
 
 @struct.dataclass
@@ -81,6 +82,10 @@ class SampleConfig:
     min_p: float = 0.0
     inverse: bool = False
     constraint: Constraint | None = None
+
+    def __post_init__(self) -> None:
+        above(self, 0, "temperature", "top_p")
+        within(self, 0, 1, "top_p", "min_p")
 
 
 def encode_prompts(

@@ -85,7 +85,7 @@ def over_minibatches(parts: dict[str, Float[Array, "n"]]) -> dict[str, Float[Arr
     """
     found = {name: (jnp.max if name.endswith("_peak") else jnp.mean)(x) for name, x in parts.items()}
     streams = {GROUNDING + n.removeprefix(PERTURBED): n for n in parts if n.startswith(PERTURBED)}
-    for mean, name in (COUNTED | streams).items():
+    for mean, name in ((m, n) for m, n in (COUNTED | streams).items() if m in parts):
         found[name] = jnp.sum(count := parts[name])
         found[mean] = jnp.sum(count * parts[mean]) / jnp.maximum(found[name], 1.0)
     return found

@@ -198,6 +198,19 @@ def test_one_object_has_neither_an_interval_of_skill_nor_a_crossed_test():
         statistics.crossed_test(np.ones((5, 3)), np.zeros(3, int))
 
 
+@pytest.mark.parametrize(
+    ("name", "interval"),
+    [
+        ("scores", statistics.stratified_bootstrap_iqm),
+        ("better", lambda one: statistics.improvement_interval(one, np.eye(2))),
+        ("than", lambda one: statistics.improvement_interval(np.eye(2), one)),
+    ],
+)
+def test_one_run_has_no_interval_over_runs(name, interval):
+    with pytest.raises(ValueError, match=f"{name} holds 1 runs: an interval over runs needs two"):
+        interval(np.eye(2)[:1])
+
+
 def test_resamples_of_objects_without_reference_error_are_left_out():
     """An eighth of the resamples of three objects holds none but the two that have no reference error."""
     found = skill(np.array([1.0, 0.0, 0.0]), np.array([2.0, 0.0, 0.0]), np.arange(3))

@@ -2,6 +2,7 @@
 
 import itertools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -57,7 +58,7 @@ def test_zero_variance_groups_have_no_part_in_the_sigma_of_the_batch():
 
 def by_hand(kind: Advantage, terms: list[np.ndarray]) -> np.ndarray:
     """Advantages of rewards [P, G] in plain NumPy, one rollout after the other."""
-    reward, epsilon = sum(terms), Paper().epsilon
+    terms, reward, epsilon = [t.astype(float) for t in terms], sum(terms).astype(float), Paper().epsilon
 
     def of_group(row: np.ndarray) -> np.ndarray:
         return (row - row.mean()) / (row.std() + epsilon)
@@ -80,8 +81,11 @@ def by_hand(kind: Advantage, terms: list[np.ndarray]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", Advantage)
-def test_every_comparison_equals_numpy(kind):
+@pytest.mark.parametrize("offset", [0.0, 2.0**20])
+def test_every_comparison_equals_numpy(kind, offset):
+    """Also of rewards far from 0, whose mean float32 rounds by up to a sixteenth."""
     terms = [np.random.default_rng(seed).random((4, 6)).astype(np.float32) for seed in range(3)]
+    terms[0] += np.float32(offset)
     found = advantages(
         Paper(advantage=kind), jnp.asarray(sum(terms)), {str(i): jnp.asarray(t) for i, t in enumerate(terms)}
     )
@@ -112,6 +116,7 @@ def test_the_best_of_k_is_the_mean_over_all_sets_with_a_rollout(k):
     np.testing.assert_allclose(
         found.mean(-1), [np.mean([row[list(s)].max() for s in sets]) for row in reward], atol=1e-6
     )
+    assert k == 1 or str(jax.make_jaxpr(lambda x: best_of(x, k))(reward)).count("HIGHEST") == 2
 
 
 def test_the_best_of_a_group_is_all_that_counts_where_k_is_its_size():

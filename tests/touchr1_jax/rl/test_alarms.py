@@ -6,9 +6,7 @@ import pytest
 from touchr1_jax.rl.alarms import RULES, WINDOW, AlarmMonitor, echo_excess
 
 HEALTHY = {
-    "labels_level_0": 20.0,
-    "labels_level_1": 20.0,
-    "labels_level_2": 20.0,
+    "middle_labels": 1 / 3,
     "middle_rate": 0.4,
     "echo_share": 0.7,
     "accuracy": 0.7,

@@ -116,6 +116,13 @@ def test_a_single_prompt_has_nobody_to_swap_with():
     np.testing.assert_array_equal(swapped.features.touch, one.touch)
 
 
+def test_the_touch_of_the_same_contact_is_no_control():
+    """Two questions about one contact and one about another: by a shift of 1 or 2, each prompt sees the next."""
+    features = jax.tree.map(lambda x: x[jnp.array([0, 0, 1])], FEATURES)
+    found = {tuple(swap_touch(features, key).applies.tolist()) for key in many()[:20]}
+    assert found == {(False, True, True), (True, False, True)}
+
+
 def test_one_present_stream_is_masked_uniformly():
     p = 2000
     features = tiny.features(0, 3)

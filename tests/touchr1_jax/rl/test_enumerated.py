@@ -175,6 +175,24 @@ def test_weights_of_rollouts_make_up_for_a_sampler_that_draws_other_traces(norm_
     np.testing.assert_allclose(total, true_gradient()[1], atol=2e-6)
 
 
+@pytest.mark.parametrize("learned", [True, False])
+def test_only_tokens_of_the_trace_count_as_clipped(learned):
+    """All ratios are e; of the two traces the first is the better one, and its third token is the level."""
+    config = GRPOConfig(
+        prompts=1,
+        micro_prompts=1,
+        group=2,
+        length=4,
+        algorithm=Paper(enumerated=Norm.NONE, learn_conclusion=learned, beta=0.0, gamma=0.0),
+    )
+    log_p, old, exists = jnp.zeros((1, 2, 4)), jnp.full((1, 2, 4), -1.0), jnp.ones((1, 2, 4), bool)
+    at, zero = jnp.full((1, 2), 2), jnp.zeros((1, 2))
+    levels = LevelRewards(ids=jnp.arange(2)[None], at=at, reward=REWARD[None], sampled=zero)
+    found = TokenTerms(log_p, log_p, log_p, log_p, jnp.log(PROBABILITY)[None])
+    run = jax.jit(lambda old: grpo_loss(found, old, old, exists, zero, jnp.ones(1), config, levels=levels)[1])
+    np.testing.assert_allclose(run(old)["clip_share"], 0.25)
+
+
 def test_the_conclusion_begins_after_its_only_tag():
     tokens = jnp.array([[5, 7, 1, 2], [5, 1, 2, 7], [5, 1, 2, 3], [7, 1, 7, 2]])
     np.testing.assert_array_equal(conclusion_place(tokens, 7), [2, 4, 4, 4])

@@ -148,7 +148,7 @@ def test_metrics_of_tokens_are_those_of_prompts_that_have_some(experience):
     each = [alone(jax.tree.map(lambda x, p=p: x[p : p + 1], some))[1] for p in range(P)]
     assert (whole["kept_prompts"], whole["drawn_prompts"]) == (P - 1, P)
     assert (parts["kept_prompts"], parts["drawn_prompts"]) == (P - 2, P - 1)
-    for name, first in (("entropy", 2), ("clip_share", 2), ("sampler_gap", 1)):
+    for name, first in (("kl", 2), ("grounding", 2), ("entropy", 2), ("clip_share", 2), ("sampler_gap", 1)):
         np.testing.assert_allclose(parts[name], np.mean([e[name] for e in each[first:]]), rtol=1e-5)
 
 

@@ -1,5 +1,7 @@
 """Metrics of a step by hand."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -37,11 +39,17 @@ def test_rollout_metrics_by_hand():
         "degenerate_share": 0.5,
         "accuracy": 0.25,
         "middle_rate": 0.5,
+        "middle_labels": 0.0,
         "parse_rate": 0.5,  # the two of prompt 0; one ⊥, one not formatted
         "truncated_share": 0.25,
         "length": 2.0,
     }
     assert_metrics(ours, expected)
+    for levels, below, middle in ((2, 1, (0.0, 0.0)), (5, 0, (0.5, 1.0))):  # two levels have no middle one
+        changed = dataclasses.replace(parsed, conclude=parsed.conclude - below)
+        scale = dataclasses.replace(target, levels=jnp.full_like(target.levels, levels))
+        found = rollout_metrics(rollout, reward, jnp.array([False, True]), changed, scale)
+        assert (found["middle_rate"], found["middle_labels"]) == middle
 
 
 def test_answer_metrics_by_hand():

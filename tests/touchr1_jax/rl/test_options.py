@@ -11,7 +11,17 @@ import pytest
 
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.rl.test_grpo import FNS, FROZEN, P, score
-from touchr1_jax.rl.config import Advantage, Average, GRPOConfig, Gspo, Norm, Paper, ReinforcePlusPlus, Rloo
+from touchr1_jax.rl.config import (
+    Advantage,
+    Average,
+    GRPOConfig,
+    Gspo,
+    Norm,
+    Paper,
+    ReinforcePlusPlus,
+    Rloo,
+    at_precision,
+)
 from touchr1_jax.rl.enumerated import LevelRewards
 from touchr1_jax.rl.gradient import Experience, log_probs
 from touchr1_jax.rl.grpo import make_grpo_step, start_state
@@ -134,6 +144,19 @@ def test_the_kl_in_the_reward_is_a_term_of_it(lagging):
     paid = jax.vmap(jax.vmap(lambda o, t: score(o, t)[0], (0, None)))(rollout.tokens, BATCH.target)
     np.testing.assert_allclose(metrics["reward"], metrics["reward_kl"] + np.mean(paid), rtol=1e-4)
     assert not {"kl", "kl_peak", "kl_cost_peak"} & metrics.keys()  # the loss computes none
+
+
+@pytest.mark.long
+def test_a_sampler_that_rounds_otherwise_is_no_kl_in_the_reward():
+    """The policy is its reference and all answers earn alike: what bfloat16 rounds would be an advantage of .06."""
+    config = dataclasses.replace(CONFIG, bfloat16=True, algorithm=Paper(gamma=0.0, kl_in_reward=True))
+    alike = lambda o, t: (jnp.ones(()), {"right": jnp.ones(())}, score(o, t)[2])
+    step, state = (
+        make_grpo_step(FNS, alike, OPTIMIZER, config),
+        start_state(START, OPTIMIZER, jax.random.key(1), config),
+    )
+    _, metrics = step(state, BATCH, FROZEN._replace(reference=at_precision(config, START)))
+    assert (metrics["sampler_gap"] > 0, metrics["reward_kl"], metrics["advantage_peak"]) == (True, 0, 0)
 
 
 @pytest.mark.long
@@ -333,11 +356,12 @@ def test_the_learner_scores_what_was_sampled_as_the_sampler_did():
 def test_metrics_of_minibatches_count_prompts_and_weigh_streams_by_them():
     """Stream 0 was perturbed in three prompts of the first half, with grounding .2, and in one of the second, .6.
 
-    All rollouts of the second half were cut off and are masked, so that it has neither entropy nor clipped tokens.
+    All rollouts of the second half were cut off and are masked, so that it has neither entropy, KL nor clipped tokens.
     """
     parts = {
         "entropy": [0.5, 0.0],
         "clip_share": [0.1, 0.0],
+        "kl": [0.4, 0.0],
         "kept_prompts": [2.0, 0.0],
         "sampler_gap": [0.2, 0.3],
         "drawn_prompts": [1.0, 3.0],
@@ -349,7 +373,7 @@ def test_metrics_of_minibatches_count_prompts_and_weigh_streams_by_them():
     parts |= {"grounding_stream_1": [0.0, 0.0], "perturbed_stream_1": [0.0, 0.0]}
     found = over_minibatches({name: jnp.array(x) for name, x in parts.items()})
     hand = {"grounding_stream_0": 0.3, "perturbed_stream_0": 4, "grounding_stream_1": 0, "perturbed_stream_1": 0}
-    hand |= {"entropy": 0.5, "clip_share": 0.1, "kept_prompts": 2, "sampler_gap": 0.275, "drawn_prompts": 4}
+    hand |= {"entropy": 0.5, "clip_share": 0.1, "kl": 0.4, "kept_prompts": 2, "sampler_gap": 0.275, "drawn_prompts": 4}
     assert found == pytest.approx(hand | {"loss": 1.5, "kl_peak": 5})
 
 

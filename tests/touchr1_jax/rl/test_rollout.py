@@ -118,6 +118,8 @@ def test_inverse_draws_by_hand():
 def test_settings_of_the_sampler_never_change():
     with pytest.raises(dataclasses.FrozenInstanceError):
         CONFIG.greedy = False
+    with pytest.raises(ValueError, match=r"temperature is 0\.0: must be above 0"):  # drew token 0, of NaN
+        dataclasses.replace(CONFIG, greedy=False, temperature=0.0)
 
 
 def test_tokens_of_a_rollout_are_independent_draws():
