@@ -150,9 +150,20 @@ def stored_ns(seconds: np.ndarray, file: str) -> np.ndarray:
     """
     if not np.isfinite(seconds).all() or (np.diff(seconds) < 0).any():
         raise UnreadableError(f"{file} has times that are not finite, or run backwards")
-    return np.rint(seconds * 1e9).astype(np.int64)
+    return whole(seconds * 1e9, f"{file}, times in ns")
 
 
 def nominal_ns(frame: np.ndarray, rate_hz: float) -> np.ndarray:
     """Times of frame numbers at a stated rate, int64 [N]."""
-    return np.rint(np.asarray(frame, np.float64) * (1e9 / rate_hz)).astype(np.int64)
+    return whole(np.asarray(frame, np.float64) * (1e9 / rate_hz), "frame numbers, times in ns")
+
+
+def whole(values: np.ndarray, what: str) -> np.ndarray:
+    """Values rounded to int64.
+
+    Raises:
+      UnreadableError: they are not finite, or beyond 64 bits.
+    """
+    if not (np.abs(values) < 2.0**63).all():
+        raise UnreadableError(f"{what}: reach {np.abs(values).max():.3g}, which 64 bits cannot hold; check their unit")
+    return np.rint(values).astype(np.int64)

@@ -6,8 +6,8 @@ import zlib
 import numpy as np
 import pytest
 
-from sensors_io.importers.keep import Keep
-from sensors_io.importers.pictures import PictureError, natural, numbered, read_picture, read_pictures
+from sensors_io.importers.keep import Keep, UnreadableError
+from sensors_io.importers.pictures import PictureError, natural, nominal_ns, numbered, read_picture, read_pictures
 from tests.sensors_io.checks import refused
 from tests.sensors_io.importers.films import cut, picture
 
@@ -49,6 +49,7 @@ def test_names_are_ordered_by_their_numbers(tmp_path):
         (tmp_path / name).touch()
     assert [path.name for path in numbered(tmp_path)] == ["frame_9.png", "frame_10.png", "frame_100.png"]
     assert numbered(tmp_path / "absent") == []
+    refused(UnreadableError, "reach 3.33e\\+37, which 64 bits", nominal_ns, np.array([1, 10**30]), 30.0)
     assert natural(tmp_path / "a2b") < natural(tmp_path / "a10b")
     assert natural(tmp_path / "a٢b") < natural(tmp_path / "a10b") < natural(tmp_path / "a10²1")
 
