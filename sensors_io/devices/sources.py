@@ -14,6 +14,7 @@ from sensors_io.devices import tac3d_messages
 from sensors_io.devices.base import Identity
 from sensors_io.devices.errors import DeviceNotFoundError
 from sensors_io.errors import path_text
+from sensors_io.importers.pictures import below
 from sensors_io.records import RecordStore
 from sensors_io.schema import FRAME_ARRAYS, Sequence
 
@@ -45,7 +46,7 @@ class SampleSource(Protocol):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PictureFolder:
-    """All pictures below a folder, in the order of their names.
+    """All pictures below a folder, in the order of the numbers in their names.
 
     Args:
       path: the folder.
@@ -67,7 +68,7 @@ class PictureFolder:
         return Identity(sensor=self.sensor, product="pictures", where=str(self.path), period_s=1 / self.rate_hz)
 
     def samples(self) -> Iterator[Recorded]:
-        paths = sorted(p for p in self.path.rglob("*") if p.suffix.lower() in PICTURES)
+        paths = below(self.path, PICTURES)
         if not paths:
             raise DeviceNotFoundError(f"{self.path} holds no picture ({', '.join(PICTURES)}); give another folder")
         for i, path in enumerate(paths):
