@@ -77,6 +77,18 @@ def encode_sequence(sequence: Sequence) -> bytes:
     return _pack("sequence", plain, arrays, where=sequence.name)
 
 
+def require_storable(sequence: Sequence) -> None:
+    """Check before anything is written that no array is beyond what is stored, at a small part of the cost of encoding.
+
+    Raises:
+      SchemaError: as `encode_sequence` for arrays.
+    """
+    for name in TOLERANCE:
+        array = getattr(sequence, name)
+        if array is not None and not _wide(name, array):
+            quantise(name, array, where=sequence.name)
+
+
 def decode_sequence(data: bytes, *, fields: bool = True) -> Sequence:
     """The sequence that `encode_sequence` packed; its arrays are read-only views of `data` where possible.
 

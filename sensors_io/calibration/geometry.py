@@ -128,6 +128,8 @@ class CameraGeometry:
             for array, shape in zip((found.centre_px, found.radial, found.homography), shapes, strict=True):
                 if array.shape != shape or not np.isfinite(array).all():
                     raise ValueError(f"its arrays must be finite, of shapes {shapes}")
+            if min(found.size_px) < 1 or not np.linalg.det(found.homography):
+                raise ValueError("its size must be ≥ 1 px, and its homography one that can be inverted")
             return found
         except (OSError, *MALFORMED) as error:
             raise GeometryError(

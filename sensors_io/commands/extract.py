@@ -53,7 +53,7 @@ class Extract:
     geometry: pathlib.Path | None = None
     """File written by `geometry`: pictures are rectified first. Must be the file that `calibrate` was given."""
     rows: int = 0
-    """Of new records: rows of the fields; 0 takes those of the pictures."""
+    """Of new records: rows of the fields; 0, or more than the pictures have, takes those of the pictures."""
     launcher: Annotated[Launcher, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Launcher)
     config: Annotated[ExtractConfig, tyro.conf.arg(name="")] = dataclasses.field(default_factory=ExtractConfig)
 

@@ -33,6 +33,7 @@ class Extraction:
         calibration = None if self._calibration is None else Calibration.load(self._calibration)
         pitch = device.identity.mm_per_px or self._mm_per_px
         if calibration is not None:
+            calibration.require_sensor(device.identity.sensor)
             pitch = calibration.mm_per_px
         extractor = Extractor(read_picture(self._background), pitch, calibration)
         for reason in extractor.refused:

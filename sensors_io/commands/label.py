@@ -11,7 +11,7 @@ from sensors_io.cards import replace_cards
 from sensors_io.commands.console import OUT
 from sensors_io.importers.holdout import split_by_name
 from sensors_io.importers.keep import Shares
-from sensors_io.importers.label_table import ID, LabelRow, LabelsError, labelled, read_labels
+from sensors_io.importers.label_table import ID, SPLIT, LabelRow, LabelsError, labelled, read_labels
 from sensors_io.records import RecordStore
 from sensors_io.schema import ObjectCard
 
@@ -21,8 +21,8 @@ class Label(Shares):
     """Give recorded objects labels and splits from a table, so that a study can train on them; contacts stay.
 
     The table is a CSV file with a column object_id and any of hardness, roughness, protrusion (0, 1 or 2, from soft,
-    smooth, flat upwards), material, split and name.  An empty cell is unknown.  Objects that are labelled for the first
-    time and have no split are dealt out to train, val and test by their ids.
+    smooth, flat upwards), material, split and name.  An empty cell is unknown, a missing column keeps what there is.
+    Objects that are labelled for the first time and have no split are dealt out to train, val and test by their ids.
     """
 
     records: tyro.conf.Positional[pathlib.Path]
@@ -47,7 +47,11 @@ class Label(Shares):
 
     def _labelled(self, known: Mapping[str, ObjectCard], rows: Mapping[str, LabelRow]) -> Iterable[ObjectCard]:
         cards = {name: labelled(known[name], row, self.annotator) for name, row in rows.items()}
-        new = [name for name, card in cards.items() if card.split == "unlabelled" and card.labels]
+        new = [
+            name
+            for name, card in cards.items()
+            if card.split == "unlabelled" and card.labels and not rows[name].cells.get(SPLIT)
+        ]
         for name, split in split_by_name(new, val_share=self.val_share, test_share=self.test_share).items():
             cards[name] = dataclasses.replace(cards[name], split=split)
         return cards.values()

@@ -28,6 +28,7 @@ def require_possible(value: Any, where: str = "") -> None:
     if dataclasses.is_dataclass(value):
         for field in dataclasses.fields(value):
             require_possible(getattr(value, field.name), field.name)
+        _require_other_output(value)
     elif isinstance(value, tuple):
         for each in value:
             require_possible(each, where)
@@ -44,6 +45,18 @@ def require_possible(value: Any, where: str = "") -> None:
         raise ValueError(f"{where} is {value}: must be a number within ±{MOST:g}; correct it")
     elif isinstance(value, int) and where.endswith("port") and not 0 <= value <= PORTS:
         raise ValueError(f"{where} is {value}: must lie in 0 … {PORTS}; correct it")
+
+
+def _require_other_output(command: Any) -> None:
+    """Refuse an output that would replace a file which the command reads."""
+    out = getattr(command, "out", None)
+    if not isinstance(out, pathlib.Path) or not out.is_file():
+        return
+    for field in dataclasses.fields(command):
+        found = getattr(command, field.name)
+        for path in found if isinstance(found, tuple) else (found,):
+            if field.name != "out" and isinstance(path, pathlib.Path) and path.exists() and path.samefile(out):
+                raise ValueError(f"out is {out}: is {field.name} as well, which would be lost; name another file")
 
 
 def _in_circle(path: pathlib.Path) -> bool:

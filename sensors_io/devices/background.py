@@ -43,19 +43,11 @@ class GelBackground:
         return self._count
 
     def offer(self, frame: np.ndarray, *, touched: bool) -> None:
-        """Take a frame [H, W, 3] into the mean, unless something touches the gel.
-
-        Raises:
-          ValueError: a frame of another shape.
-        """
+        """Take a frame [H, W, 3] into the mean, unless something touches the gel; one of another shape begins anew."""
         if touched:
             return
-        if self._mean is None:
-            self._mean = frame.astype(np.float32)
-        elif frame.shape != self._mean.shape:
-            raise ValueError(
-                f"frame is {list(frame.shape)}: must be {list(self._mean.shape)} as before; start a new background"
-            )
+        if self._mean is None or frame.shape != self._mean.shape:
+            self._mean, self._first, self._count = frame.astype(np.float32), None, 0
         self._count += 1
         self._mean += (frame - self._mean) / np.float32(min(self._count, self._memory))
         if self._count == self._memory:
@@ -67,7 +59,7 @@ class GelBackground:
         More than one pixel in two hundred has changed by over 12 grey levels beyond the median change of its channel,
         which is that of the lamps.  Before there is a background nothing looks touched: start with a free gel.
         """
-        if self._mean is None:
+        if self._mean is None or frame.shape != self._mean.shape:
             return False
         change = frame[::_STRIDE, ::_STRIDE] - self._mean[::_STRIDE, ::_STRIDE]
         beyond = np.abs(change - np.median(change, axis=(0, 1))).max(-1) > _CHANGED_LEVELS

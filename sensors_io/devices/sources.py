@@ -14,6 +14,7 @@ from sensors_io.devices import tac3d_messages
 from sensors_io.devices.base import Identity
 from sensors_io.devices.errors import DeviceNotFoundError
 from sensors_io.errors import path_text
+from sensors_io.importers.pictures import PictureError, below, read_picture
 from sensors_io.records import RecordStore
 from sensors_io.schema import FRAME_ARRAYS, Sequence
 
@@ -45,7 +46,7 @@ class SampleSource(Protocol):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PictureFolder:
-    """All pictures below a folder, in the order of their names.
+    """All pictures below a folder, in the order of the numbers in their names.
 
     Args:
       path: the folder.
@@ -67,7 +68,7 @@ class PictureFolder:
         return Identity(sensor=self.sensor, product="pictures", where=str(self.path), period_s=1 / self.rate_hz)
 
     def samples(self) -> Iterator[Recorded]:
-        paths = sorted(p for p in self.path.rglob("*") if p.suffix.lower() in PICTURES)
+        paths = below(self.path, PICTURES)
         if not paths:
             raise DeviceNotFoundError(f"{self.path} holds no picture ({', '.join(PICTURES)}); give another folder")
         for i, path in enumerate(paths):
@@ -149,7 +150,12 @@ class RecordedContact:
 
     @functools.cached_property
     def _sequence(self) -> Sequence:
-        contact = RecordStore(self.path, allow_incomplete=True).contact(self.contact)
+        store = RecordStore(self.path, allow_incomplete=True)
+        if self.contact >= len(store):
+            raise DeviceNotFoundError(
+                f"{self.path}: contact is {self.contact}: must be < {len(store)}, the contacts there; name one of them"
+            )
+        contact = store.contact(self.contact)
         if self.sensor not in contact:
             raise DeviceNotFoundError(
                 f"{self.path}: contact {self.contact} was seen by {', '.join(contact)}, not {self.sensor!r}; "
@@ -192,10 +198,12 @@ def _read_picture(path: pathlib.Path) -> np.ndarray:
     image = cv2.imread(path_text(path), cv2.IMREAD_UNCHANGED)
     if image is not None and image.ndim == 2 and image.dtype == np.uint16:
         return image
-    image = cv2.imread(path_text(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise DeviceNotFoundError(f"{path} cannot be decoded as a picture; take it out of the folder")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    try:
+        return read_picture(path)
+    except PictureError as error:
+        raise DeviceNotFoundError(
+            f"{path} cannot be decoded as a picture ({error}); take it out of the folder"
+        ) from error
 
 
 def _require_rate(rate_hz: float) -> None:

@@ -73,6 +73,8 @@ class RecordedGels:
             raise CalibrationError("they hold no pictures")
         shape = sequence.frames.shape[1:]
         calibration = self._calibration
+        if calibration is not None:
+            calibration.require_sensor(sequence.sensor)
         if calibration is not None and calibration.background.shape != shape:
             calibration = calibration.at_size((shape[0], shape[1]))
         pitch = self._pitch(sequence, calibration)
@@ -136,11 +138,12 @@ def with_fields(sequence: Sequence, fields: Fields, calibration: str, rows: int 
       sequence: N pictures.
       fields: of them.
       calibration: hash of the calibration, empty without one.
-      rows: of the fields; 0 takes those of the pictures.
+      rows: of the fields; 0, or more than the pictures have, takes those of the pictures.
     """
     assert sequence.frames is not None
     height, width = sequence.frames.shape[1:3]
-    size = (max(1, round(width * (rows or height) / height)), rows or height)
+    rows = min(rows or height, height)
+    size = (max(1, round(width * rows / height)), rows)
     found: dict[str, Any] = {}
     for name in ("depth_mm", "deformation_mm", "shear_mm"):
         array = getattr(fields, name)

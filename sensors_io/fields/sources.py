@@ -10,13 +10,14 @@ from sensors_io.errors import UserError
 from sensors_io.importers import pictures
 from sensors_io.importers.keep import Keep
 from sensors_io.importers.video import VideoError, read_video
+from sensors_io.importers.videos import SUFFIXES
 from sensors_io.index import INDEX
 from sensors_io.quality import QualityConfig, time_gap
 from sensors_io.records import RecordStore
 from sensors_io.schema import Flag
 
 PICTURES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"})
-VIDEOS = frozenset({".mp4", ".mov", ".avi", ".mkv"})
+VIDEOS = frozenset(SUFFIXES)
 
 
 class SourceError(UserError, ValueError):
@@ -99,10 +100,14 @@ def _read(path: pathlib.Path, sensor: str) -> Iterator[_Shot]:
     if (path / INDEX).exists():
         yield from _records(path, sensor)
     elif path.is_dir():
-        files = sorted((p for p in path.rglob("*") if p.suffix.lower() in PICTURES), key=_by_number)
+        files = pictures.below(path, PICTURES)
         if not files:
             kinds = ", ".join(sorted(PICTURES))
             raise SourceError(f"{path} holds no picture ({kinds}): name a folder that does")
+        if films := [f for f in path.rglob("*") if f.suffix.lower() in VIDEOS]:
+            raise SourceError(
+                f"{path} holds pictures and videos, such as {films[0]}: must be one kind; name them apart"
+            )
         yield from (_Shot(name=str(f.relative_to(path)), frame=read_picture(f), apart=True) for f in files)
     elif path.suffix.lower() in VIDEOS:
         try:
@@ -128,9 +133,3 @@ def _records(path: pathlib.Path, sensor: str) -> Iterator[_Shot]:
                     yield _Shot(name=f"{sequence.name}#{n}", frame=frame, gap=gap, apart=n == 0)
     if not found:
         raise SourceError(f"{path} holds no camera frames of {sensor}: name another sensor or other records")
-
-
-def _by_number(path: pathlib.Path) -> tuple[tuple[int, str], ...]:
-    """Order in which 2 comes before 10."""
-    parts = "".join(c if c.isdecimal() else " " + c + " " for c in str(path)).split()
-    return tuple((int(p), "") if p.isdecimal() else (-1, p) for p in parts)

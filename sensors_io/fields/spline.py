@@ -93,8 +93,13 @@ class ThinPlate:
           bool [P], at most all but four of the found ones.
         """
         kept = np.flatnonzero(found)
-        bending = self._of(found)
         out = np.zeros(len(found), bool)
+        if len(kept) <= 4:  # nothing is left to predict by, and below three points no plane
+            return out
+        try:
+            bending = self._of(found)
+        except np.linalg.LinAlgError:  # they lie on a line, so that none predicts another
+            return found.copy()
         while len(kept) > 4:
             error = np.hypot(*(bending @ displacement[kept]).T) / np.diag(bending)
             worst = int(error.argmax())

@@ -104,6 +104,18 @@ class Calibration:
             digest.update(f"{array.dtype}{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()[:16]
 
+    def require_sensor(self, sensor: str) -> None:
+        """Refuse pictures of another sensor.
+
+        Raises:
+          CalibrationError: it is for another one.
+        """
+        if self.sensor != sensor:
+            raise CalibrationError(
+                f"calibration is for {self.sensor!r}, the pictures are of {sensor!r}: must be equal; name the sensor, "
+                "or give its calibration"
+            )
+
     def at_size(self, size_px: tuple[int, int]) -> Self:
         """The calibration for pictures of the same window at another size: the map depends on the place in the window.
 

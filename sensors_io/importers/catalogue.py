@@ -17,13 +17,14 @@ from collections.abc import Callable, Iterable, Mapping
 from collections.abc import Sequence as Seq
 from typing import Any
 
+from sensors_io.codec import require_storable
 from sensors_io.importers.gel import NO_GEL, SourceGel
 from sensors_io.importers.holdout import split_by_name
 from sensors_io.importers.keep import ImportSourceError, Shares, Skip, UnreadableError, at_height
 from sensors_io.importers.pictures import read_picture
 from sensors_io.index import INDEX, Index
 from sensors_io.records import RecordsExistError, RecordsMeta, RecordWriter
-from sensors_io.schema import ATTRIBUTES, SPLITS, UNKNOWN, ContactKey, ObjectCard, Sequence
+from sensors_io.schema import ATTRIBUTES, SPLITS, UNKNOWN, ContactKey, ObjectCard, SchemaError, Sequence
 
 _VIEW_ROWS = 240  # of a stored view: twice what a clip shows
 _NOTE, _IDENTITY = "left_out", "identity"
@@ -175,7 +176,10 @@ class _Run:
             return
         try:
             taken = listed.read()
-        except UnreadableError as error:
+            sequences = [self.gel.kept(sequence) for sequence in taken.sequences]
+            for sequence in sequences:
+                require_storable(sequence)
+        except (UnreadableError, SchemaError) as error:
             self.unread.append(Skip(name=listed.name, reason=str(error)))
             return
         left_out = list(taken.left_out)
@@ -186,7 +190,7 @@ class _Run:
         if left_out:
             self.notes[str(n)] = [dataclasses.asdict(skip) for skip in left_out]
             self.writer.note(**{_NOTE: self.notes})
-        self.writer.write_contact([self.gel.kept(sequence) for sequence in taken.sequences])
+        self.writer.write_contact(sequences)
 
     def report(self) -> ImportReport:
         """Report of recordings that were imported and left out."""

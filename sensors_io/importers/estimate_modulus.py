@@ -34,7 +34,8 @@ def list_estimate_modulus(source: pathlib.Path, config: ImportConfig) -> Catalog
     Raises:
       ImportSourceError: no .avi there.
     """
-    videos = sorted(source.rglob("*.avi"), key=lambda path: (path.parent, natural(path)))
+    found = (path for path in source.rglob("*") if path.suffix.lower() == ".avi")
+    videos = sorted(found, key=lambda path: (path.parent, natural(path)))
     require_files(source, videos, "<object>_<n>.avi with <object>_<n>_forces.pkl")
     contacts, skipped, trials = [], [], collections.Counter[str]()
     for path in videos:

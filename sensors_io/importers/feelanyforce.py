@@ -35,6 +35,7 @@ SENSOR = "gelsight_mini"
 COLUMNS = ("tactile", "FT")
 NO_FORCE = "has no six readings"
 NO_ROW = "incomplete row: names no picture and has no reading"
+_NS = 1_000_000  # of a millisecond
 LEAST_PUSH_N = 1.0
 """Below it drift and noise may have either sign: 0.15 N in a recording that shows no contact."""
 
@@ -65,7 +66,7 @@ def list_feelanyforce(source: pathlib.Path, config: FeelAnyForceConfig) -> Catal
     Raises:
       ImportSourceError: no table there, or one without the columns, or no row with a reading.
     """
-    tables = sorted(source.glob("*.csv"))
+    tables = sorted(path for path in source.glob("*") if path.suffix.lower() == ".csv")
     require_files(source, tables, "<table>.csv with the columns tactile, depth, FT")
     rows, skipped = _rows(source, tables)
     if not any(row.force_n for row in rows):
@@ -117,7 +118,8 @@ def _rows(source: pathlib.Path, tables: list[pathlib.Path]) -> tuple[list[_Readi
             if not cells["tactile"].strip() and _force(cells["FT"]) is None:
                 skipped.append(Skip(name=f"{table.name}, line {line}", reason=NO_ROW))
                 continue
-            if not name.stem.isdecimal() or len(name.parts) < 3 or name.is_absolute() or ".." in name.parts:
+            dated = name.stem.isdecimal() and int(name.stem) * _NS < 2**63
+            if not dated or len(name.parts) < 3 or name.is_absolute() or ".." in name.parts:
                 reason = "names no <indenter>/tactile/<ms>.png"
                 skipped.append(Skip(name=f"{table.name}, line {line}", reason=reason))
                 continue
@@ -153,7 +155,7 @@ def _read(key: ContactKey, rows: list[_Reading], sign: float, config: FeelAnyFor
         key,
         SENSOR,
         gap=pictures.after_loss(),
-        host_time_ns=np.array([row.time_ms for row in kept], np.int64) * 1_000_000,
+        host_time_ns=np.array([row.time_ms for row in kept], np.int64) * _NS,
         camera=camera | {"force_sign": sign},
         frames=pictures.frames,
         force_n=force_n * np.float32(sign),

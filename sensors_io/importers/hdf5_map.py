@@ -42,9 +42,9 @@ PLACEHOLDER = "?"
 
 UNITS: Mapping[str, Mapping[str, float]] = {
     "picture": {"": 1.0, "1": 255.0},
-    "length": {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3},
-    "force": {"N": 1.0, "mN": 1e-3},
-    "moment": {"N mm": 1.0, "N m": 1e3},
+    "length": {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3, "in": 25.4},
+    "force": {"N": 1.0, "mN": 1e-3, "kN": 1e3, "kgf": 9.80665, "lbf": 4.4482216152605},
+    "moment": {"N mm": 1.0, "N cm": 10.0, "N m": 1e3},
     "time": {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0},
 }
 """Quantity → unit → factor to the unit of the schema; a picture in "1" runs from 0 to 1."""

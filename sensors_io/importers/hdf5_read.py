@@ -22,7 +22,9 @@ STATED = ("unit", "units")
 SPELLED = {
     "meter": "m", "meters": "m", "metre": "m", "metres": "m", "millimeter": "mm", "millimeters": "mm",
     "millimetre": "mm", "millimetres": "mm", "µm": "um", "μm": "um", "micrometer": "um", "micrometers": "um",
-    "newton": "N", "newtons": "N", "n": "N", "nm": "N m", "n*m": "N m", "nmm": "N mm",
+    "centimeter": "cm", "centimeters": "cm", "centimetre": "cm", "centimetres": "cm", "inch": "in", "inches": "in",
+    "newton": "N", "newtons": "N", "n": "N", "nm": "N m", "n*m": "N m", "nmm": "N mm", "ncm": "N cm",
+    "kilonewton": "kN", "kilonewtons": "kN", "kn": "kN", "lb": "lbf", "lbs": "lbf",
     "second": "s", "seconds": "s", "sec": "s",
     "milliseconds": "ms", "microseconds": "us", "µs": "us", "μs": "us", "nanoseconds": "ns",
 }  # fmt: skip
@@ -207,15 +209,17 @@ def _sequence(
             values[name] = rows.times_ns(positions)
         elif name != "host_time_ns":
             values[name] = rows.pictures(positions, keep) if name == "frames" else rows.values(name, positions)
-    outside = np.zeros(len(positions), np.bool_)
+    outside, notes = np.zeros(len(positions), np.bool_), [note for rows in sources.values() for note in rows.notes]
     for name in stream.arrays.keys() - own.keys():
-        values[name], beyond = _resampled(file, place, stream.arrays[name], name, sensor, times_ns[positions])
+        values[name], beyond, more = _resampled(file, place, stream.arrays[name], name, sensor, times_ns[positions])
+        notes += more
         outside |= beyond
     finite = np.all([np.isfinite(v).reshape(len(positions), -1).all(1) for v in values.values()], axis=0)
     if not finite.any():
         raise HDF5Error(f"{sensor} holds no frame of finite values")
     name = f"{place.name}, {sensor}"
     lost = [Skip(name=f"{name}, frame {n}", reason="holds values that are not finite") for n in positions[~finite]]
+    lost += [Skip(name=name, reason=note) for note in dict.fromkeys(notes)]
     kept = positions[finite]
     sequence = film(
         key,
@@ -231,8 +235,8 @@ def _sequence(
 
 def _resampled(
     file: Any, place: Place, array: ArrayMap, name: str, sensor: str, times_ns: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """An array of another clock at the times of the frames, and which frames lie outside of its time."""
+) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """An array of another clock at the times of the frames, which of them lie outside of its time, and notes on it."""
     assert array.time is not None
     rows = _Rows(file, place, array, f"{name} of {sensor}")
     clock = _Rows(file, place, array.time, f"time of {name} of {sensor}")
@@ -244,7 +248,7 @@ def _resampled(
     flat = values.reshape(len(values), -1)
     columns = [np.interp(seconds(times_ns), seconds(own_ns), column) for column in flat.T]
     found = np.stack(columns, -1).reshape(len(times_ns), *values.shape[1:]).astype(np.float32)
-    return found, (times_ns < own_ns[0]) | (times_ns > own_ns[-1])
+    return found, (times_ns < own_ns[0]) | (times_ns > own_ns[-1]), [*rows.notes, *clock.notes]
 
 
 class _Rows:
@@ -263,13 +267,14 @@ class _Rows:
             self.first, self.end = bounds(file, place.group, array.rows)[place.row : place.row + 2].tolist()
         if self.end > self.data.shape[self.axis]:
             raise HDF5Error(f"{array.path} for {what} has {self.data.shape[self.axis]} rows: {self.end} are stated")
+        self.notes: list[str] = []
         self._require_unit()
 
     def __len__(self) -> int:
         return self.end - self.first
 
     def _require_unit(self) -> None:
-        """Compare the unit that the data set states with the mapping's."""
+        """Compare the unit that the data set states with the mapping's, and note one that is not known."""
         array = self.array
         units = next(known for known in UNITS.values() if array.unit in known and known[array.unit] == array.factor)
         for name in STATED:
@@ -277,7 +282,14 @@ class _Rows:
                 continue
             for said in map(spelled, stated(self.data, name).ravel()):  # some programs state one for each component
                 unit = SPELLED.get(said.strip().lower(), said.strip())
-                if unit in units and units[unit] != array.factor:
+                if unit in UNITS["picture"]:
+                    continue
+                known = any(unit in of_kind for of_kind in UNITS.values())
+                if not known and units is not UNITS["picture"]:
+                    self.notes.append(
+                        f"{array.path} states the unit {said!r}, which is not known: taken for {array.unit!r}"
+                    )
+                elif known and units.get(unit) != array.factor:
                     raise HDF5Error(
                         f"{array.path} states the unit {said!r}, the mapping {array.unit!r} for {self.what}"
                     )

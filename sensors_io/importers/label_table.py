@@ -71,21 +71,25 @@ def read_labels(path: pathlib.Path, key: str, columns: Seq[str] = COLUMNS) -> di
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             table = csv.DictReader(file, strict=True)
-            found, lines = tuple(table.fieldnames or ()), list(table)
+            found, lines = tuple(table.fieldnames or ()), [(table.line_num, line) for line in table]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise LabelsError(
-            f"{path} cannot be read as a CSV table ({error}); write one with {', '.join((key, *others))}"
+            f"{path} cannot be read as a CSV table ({error}); write one in UTF-8, separated by commas, with "
+            f"{', '.join((key, *others))}"
         ) from error
     if key not in found or set(found) - set(columns) or len(set(found)) < len(found):
         raise LabelsError(
-            f"{path}: columns are {found}: must be {key} and any of {tuple(others)}, each once; rename or drop them"
+            f"{path}: columns are {found}: must be {key} and any of {tuple(others)}, each once, separated by commas; "
+            "rename or drop them"
         )
     rows: dict[str, LabelRow] = {}
-    for number, line in enumerate(lines, start=2):
+    for number, line in lines:
         place = f"{path}, line {number}"
         if None in line or None in line.values():
             raise LabelsError(f"{place}: must have {len(found)} cells; complete it")
         cells = {column: cell.strip() for column, cell in line.items()}
+        if not any(cells.values()):  # as spreadsheets end their tables
+            continue
         if cells[key] in rows:
             raise LabelsError(f"{place}: {key} {cells[key]!r} appears twice; keep one line")
         rows[cells[key]] = LabelRow(place=place, cells=cells)
@@ -93,11 +97,12 @@ def read_labels(path: pathlib.Path, key: str, columns: Seq[str] = COLUMNS) -> di
 
 
 def labelled(card: ObjectCard, row: LabelRow, annotator: str) -> ObjectCard:
-    """The card with the labels of its row in the place of its own, and its split and name where the row has them.
+    """The card with the labels of its row's columns in the place of its own, and a split and name that the row has.
 
     Raises:
       LabelsError: a level, material or split that does not exist.
     """
-    labels, split = row.labels(card.object_id), row.split(card.object_id, card.split)
+    kept = {attribute: level for attribute, level in card.labels.items() if attribute not in row.cells}
+    labels, split = kept | row.labels(card.object_id), row.split(card.object_id, card.split)
     name = row.cells.get(NAME) or card.name
     return dataclasses.replace(card, labels=labels, split=split, name=name, annotator=annotator)

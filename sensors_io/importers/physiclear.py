@@ -10,18 +10,16 @@ Hand motion is unguided (motion "free", site 0, phase 0) and no force was measur
 import collections
 import dataclasses
 import functools
-import hashlib
 import json
 import pathlib
 import re
 from collections.abc import Callable, Mapping
-from collections.abc import Sequence as Seq
 from typing import Any
 
 import numpy as np
 
 from sensors_io.errors import MALFORMED
-from sensors_io.importers.catalogue import Catalogue, ImportReport, Listed, Taken, import_catalogue
+from sensors_io.importers.catalogue import Catalogue, ImportReport, Listed, Taken, fingerprint, import_catalogue
 from sensors_io.importers.holdout import hold_out
 from sensors_io.importers.keep import ImportSourceError, Keep, Skip, check_share
 from sensors_io.importers.pictures import film, nominal_ns
@@ -96,7 +94,7 @@ def list_physiclear(source: pathlib.Path, config: PhysiclearConfig) -> Catalogue
     contacts, skipped = [], []
     for entry in objects:
         for name in entry.videos:
-            trial = re.fullmatch(re.escape(entry.card.object_id) + r"_(\d+)", pathlib.PurePath(name).stem)
+            trial = re.fullmatch(re.escape(entry.card.object_id) + r"_(\d{1,9})", pathlib.PurePath(name).stem)
             if trial is None:
                 skipped.append(Skip(name=name, reason=f"is not named {entry.card.object_id}_<trial>"))
                 continue
@@ -114,7 +112,7 @@ def list_physiclear(source: pathlib.Path, config: PhysiclearConfig) -> Catalogue
         contacts=tuple(contacts),
         skipped=tuple(skipped),
         config=dataclasses.asdict(config),
-        identity=_hash(source, config, present),
+        identity=fingerprint(source, [source / "videos" / name for name in present], config, (source / "labels.json",)),
     )
 
 
@@ -158,7 +156,7 @@ def _read(path: pathlib.Path, key: ContactKey, config: PhysiclearConfig) -> Take
 
 def _labelled(entry: Mapping[str, Any]) -> LabelledObject:
     """One entry of labels.json; raises KeyError, TypeError or ValueError where it is not as described."""
-    labels = {name: UNKNOWN if entry[key] is None else int(entry[key]) for key, name in ORDINAL.items()}
+    labels = {name: _level(entry, key) for key, name in ORDINAL.items()}
     material = entry["material"]
     if material is not None and material not in MATERIAL:
         raise ValueError(f"{entry['object']}: material {material!r} must be one of {', '.join(MATERIAL)}")
@@ -176,15 +174,15 @@ def _labelled(entry: Mapping[str, Any]) -> LabelledObject:
     return LabelledObject(card=card, videos=tuple(entry["videos"]))
 
 
+def _level(entry: Mapping[str, Any], key: str) -> int:
+    value = entry[key]
+    if value is not None and (isinstance(value, bool) or int(value) != value):
+        raise ValueError(f"{entry['object']}: {key} is {value!r}: must be a whole number or null")
+    return UNKNOWN if value is None else int(value)
+
+
 def _files(folder: pathlib.Path) -> list[str]:
     names = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
     if not names:
         raise ImportSourceError(f"{folder} is missing or empty: put the videos there")
     return names
-
-
-def _hash(source: pathlib.Path, config: PhysiclearConfig, present: Seq[str]) -> str:
-    """Hash of everything that decides what is imported: config, labels, names and sizes of the videos."""
-    sizes = [(name, (source / "videos" / name).stat().st_size) for name in present]
-    text = json.dumps([dataclasses.asdict(config), sizes]).encode() + (source / "labels.json").read_bytes()
-    return hashlib.sha256(text).hexdigest()[:16]

@@ -1,15 +1,17 @@
 """Pictures of a folder as the frames of a sequence, each read whole or left out by name."""
 
 import dataclasses
+import itertools
 import pathlib
 import re
+from collections.abc import Collection
 from collections.abc import Sequence as Seq
 from typing import Any
 
 import cv2
 import numpy as np
 
-from sensors_io.importers.keep import Keep, Skip, UnreadableError
+from sensors_io.importers.keep import ImportSourceError, Keep, Skip, UnreadableError
 from sensors_io.schema import ContactKey, Flag, Sequence
 
 _END = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND\xaeB`\x82"}
@@ -20,6 +22,9 @@ _TAIL = 64  # bytes that some cameras append behind the end
 
 class PictureError(UnreadableError):
     """A picture that cannot be read whole."""
+
+
+_DECIMALS = re.compile(r"\d+(?:\.\d+)?|\D+")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -71,11 +76,16 @@ def decode_picture(data: bytes) -> np.ndarray:
     if end is not None and end not in data[-_TAIL:]:
         raise PictureError("is cut off")
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB) if data else None
+        how = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), how) if data else None
     except cv2.error as error:  # it states more pixels than OpenCV makes room for
         raise PictureError("is larger than any picture") from error
     if image is None:
         raise PictureError("does not open as a picture")
+    if image.dtype != np.uint8:
+        raise PictureError(
+            f"holds {image.dtype}: must hold 8 bits a channel; convert it, by the range that its camera fills"
+        )
     return image
 
 
@@ -113,9 +123,41 @@ def read_pictures(paths: Seq[pathlib.Path], positions: np.ndarray, keep: Keep) -
 
 
 def numbered(folder: pathlib.Path, suffixes: tuple[str, ...] = (".jpg", ".jpeg", ".png")) -> list[pathlib.Path]:
-    """Pictures of a folder in the order of the numbers in their names."""
+    """Pictures of a folder in the order of the numbers in their names.
+
+    Raises:
+      ImportSourceError: names such as 0.15.png and 0.2.png, whose order depends on what the point means.
+    """
     files = [f for f in folder.iterdir() if f.suffix.lower() in suffixes] if folder.is_dir() else []
-    return sorted(files, key=natural)
+    return in_order(files)
+
+
+def below(folder: pathlib.Path, suffixes: Collection[str]) -> list[pathlib.Path]:
+    """Pictures of a folder and of those below it, folder by folder, as `numbered` orders them."""
+    found: dict[pathlib.Path, list[pathlib.Path]] = {}
+    for path in folder.rglob("*"):
+        if path.suffix.lower() in suffixes:
+            found.setdefault(path.parent, []).append(path)
+    folders = sorted(found, key=lambda path: [natural(part) for part in (*reversed(path.parents), path)])
+    return [file for each in folders for file in in_order(found[each])]
+
+
+def in_order(files: Seq[pathlib.Path]) -> list[pathlib.Path]:
+    """Files of a folder in the order of the numbers in their names.
+
+    Raises:
+      ImportSourceError: as `numbered`.
+    """
+    files = sorted(files, key=lambda path: (natural(path), path.name))
+    decimal = lambda path: [float(part) if part[0].isdecimal() else part for part in _DECIMALS.findall(path.stem)]
+    for first, then in itertools.pairwise(files):
+        before, after = decimal(first), decimal(then)
+        if [type(part) for part in before] == [type(part) for part in after] and before > after:
+            raise ImportSourceError(
+                f"{first.parent}: {first.name} and {then.name}: their order depends on whether the point is that of a "
+                "decimal number; give the numbers of all names as many digits after the point"
+            )
+    return files
 
 
 def natural(path: pathlib.Path) -> tuple[tuple[int, int | str], ...]:
@@ -150,9 +192,20 @@ def stored_ns(seconds: np.ndarray, file: str) -> np.ndarray:
     """
     if not np.isfinite(seconds).all() or (np.diff(seconds) < 0).any():
         raise UnreadableError(f"{file} has times that are not finite, or run backwards")
-    return np.rint(seconds * 1e9).astype(np.int64)
+    return whole(seconds * 1e9, f"{file}, times in ns")
 
 
 def nominal_ns(frame: np.ndarray, rate_hz: float) -> np.ndarray:
     """Times of frame numbers at a stated rate, int64 [N]."""
-    return np.rint(np.asarray(frame, np.float64) * (1e9 / rate_hz)).astype(np.int64)
+    return whole(np.asarray(frame, np.float64) * (1e9 / rate_hz), "frame numbers, times in ns")
+
+
+def whole(values: np.ndarray, what: str) -> np.ndarray:
+    """Values rounded to int64.
+
+    Raises:
+      UnreadableError: they are not finite, or beyond 64 bits.
+    """
+    if not (np.abs(values) < 2.0**63).all():
+        raise UnreadableError(f"{what}: reach {np.abs(values).max():.3g}, which 64 bits cannot hold; check their unit")
+    return np.rint(values).astype(np.int64)

@@ -10,8 +10,8 @@ gives image order, x right and y down, without touching a vector.  Pressing is u
 
 All of them are the vendor's estimates.  Moments are about the vendor's origin, on the axis of the sensor; its height
 against the window's centre is not published, and they are kept as they are.  The force per point has no place in a
-record and is left out.  A frame before which the counter `index` skips some is flagged `TIME_GAP`.  `host_time_ns` is
-the client's receive time where it was stored, the sensor's send time elsewhere.
+record and is left out.  A frame before which the counter `index` skips some or begins anew is flagged `TIME_GAP`.
+`host_time_ns` is the client's receive time where it was stored, the sensor's send time elsewhere.
 """
 
 import functools
@@ -20,9 +20,9 @@ import pathlib
 import numpy as np
 
 from sensors_io.arrays import ArraysError, load_arrays
-from sensors_io.importers.catalogue import Catalogue, Listed, Taken, bare_catalogue, require_files
+from sensors_io.importers.catalogue import Catalogue, Listed, Taken, bare_catalogue, plain_names, require_files
 from sensors_io.importers.keep import Shares, Skip, UnreadableError
-from sensors_io.importers.pictures import film
+from sensors_io.importers.pictures import film, whole
 from sensors_io.schema import ContactKey
 
 SENSOR = "tac3d"
@@ -49,11 +49,11 @@ def list_tac3d(source: pathlib.Path, config: Shares) -> Catalogue:
     Raises:
       ImportSourceError: no .npz there.
     """
-    files = sorted(source.glob("*.npz"))
+    files = sorted(path for path in source.glob("*") if path.suffix.lower() == ".npz")
     require_files(source, files, "<name>_<serial>.npz with the arrays of a PyTac3D recording")
-    contacts = []
+    contacts, names = [], plain_names((path.stem for path in files), SENSOR)
     for path in files:
-        key = ContactKey(object_id=path.stem, site=0, motion="free", trial=0)
+        key = ContactKey(object_id=names[path.stem], site=0, motion="free", trial=0)
         contacts.append(Listed(key=key, name=path.name, read=functools.partial(_read, path, key)))
     return bare_catalogue(
         source,
@@ -75,7 +75,7 @@ def _read(path: pathlib.Path, key: ContactKey) -> Taken:
     if not kept.any():
         raise RecordingError("holds no frame of finite values")
     arrays = {name: array[kept] for name, array in arrays.items()}
-    index = arrays["index"].astype(np.int64)
+    index = whole(arrays["index"], "index")
     steps = np.diff(index, prepend=index[0] - 1)
     sent_ns = _ns(arrays["sendTimestamp"])
     host_ns = _ns(arrays["recvTimestamp"]) if "recvTimestamp" in arrays else sent_ns
@@ -86,12 +86,12 @@ def _read(path: pathlib.Path, key: ContactKey) -> Taken:
     sequence = film(
         key,
         SENSOR,
-        gap=steps > 1,
+        gap=(steps > 1) | (steps < 0),
         host_time_ns=host_ns,
         device_time_ns=sent_ns,
         force_time_ns=sent_ns,
         serial=path.stem.rpartition("_")[2],
-        camera={"file": path.name, "clock": clock, "missing_frames": int((steps - 1).sum())},
+        camera={"file": path.name, "clock": clock, "missing_frames": int(np.maximum(steps - 1, 0).sum())},
         deformation_mm=np.ascontiguousarray(moved[..., :2]),
         depth_mm=-moved[..., 2],
         force_n=arrays["3D_ResultantForce"][:, 0].astype(np.float32),
@@ -113,6 +113,8 @@ def _load(path: pathlib.Path) -> dict[str, np.ndarray]:
     count = len(arrays["index"])
     for name, array in arrays.items():
         shape = _SHAPES.get(name, ())
+        if array.dtype.kind not in "fiu":
+            raise RecordingError(f"{name} holds {array.dtype}: must hold numbers")
         if array.shape != (count, *shape):
             raise RecordingError(f"{name} has shape {array.shape}: must be {(count, *shape)}")
     if not count:
@@ -129,4 +131,4 @@ def _grid(points: np.ndarray) -> np.ndarray:
 
 
 def _ns(seconds: np.ndarray) -> np.ndarray:
-    return np.rint(seconds.astype(np.float64) * 1e9).astype(np.int64)
+    return whole(seconds.astype(np.float64) * 1e9, "times in ns")

@@ -37,6 +37,8 @@ TABLES = {
 RATE_HZ = 30.0
 """Nominal."""
 
+_MOST_FRAMES = 10**6  # nine hours; a path is made for each
+
 
 def list_tacquad(source: pathlib.Path, config: ImportConfig) -> Catalogue:
     """Catalogue of the tables in a directory; a row that is not an item and six frame numbers is skipped.
@@ -84,6 +86,8 @@ def _spans(cells: list[str]) -> dict[str, tuple[int, int]]:
     numbers = [int(cell) for cell in cells]
     if len(numbers) != 2 * len(FOLDERS):
         raise ValueError(f"has {len(numbers)} numbers after the item: expected {2 * len(FOLDERS)}")
+    if max(numbers) > _MOST_FRAMES:
+        raise ValueError(f"names frame {max(numbers)}: must be ≤ {_MOST_FRAMES}")
     return {sensor: (numbers[2 * i], numbers[2 * i + 1]) for i, sensor in enumerate(FOLDERS)}
 
 

@@ -11,9 +11,11 @@ file.  Clips tell no force and no motion, which is "free".
 
 import dataclasses
 import functools
+import mimetypes
 import pathlib
+import unicodedata
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Container, Iterator, Mapping
 from collections.abc import Sequence as Seq
 
 import numpy as np
@@ -31,6 +33,8 @@ CLIP = "clip"
 
 SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
 """Of videos."""
+
+_KINDS = f"videos ({', '.join(SUFFIXES)}) or pictures (.jpg, .jpeg, .png)"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -69,7 +73,7 @@ def list_videos(source: pathlib.Path, config: VideosConfig) -> Catalogue:
       LabelsError: as `read_labels`; a clip that is not there, or rows of one object that contradict each other.
     """
     clips = _clips(source)
-    require_files(source, clips, f"videos ({', '.join(SUFFIXES)}) or folders of pictures")
+    require_files(source, clips, f"{_KINDS}, folders of them")
     named = {(p.relative_to(source).as_posix() if p != source else p.resolve().name): p for p in clips}
     rows = {} if config.labels is None else read_labels(config.labels, CLIP, (CLIP, *COLUMNS))
     if config.labels is not None and not rows:
@@ -77,13 +81,14 @@ def list_videos(source: pathlib.Path, config: VideosConfig) -> Catalogue:
     by_name: dict[str, list[str]] = {}
     for clip in named:
         for known in {clip, _plain(clip)}:
-            by_name.setdefault(known, []).append(clip)
+            by_name.setdefault(_composed(known), []).append(clip)
     row_of: dict[str, LabelRow] = {}
     for name, row in rows.items():
         if row_of.setdefault(found := _find(name, row, by_name, source), row) is not row:
             raise LabelsError(f"{row.place}: {CLIP} {name!r} is {found}, as in {row_of[found].place}; keep one line")
     names = plain_names(map(_plain, named), CLIP)
     objects = {clip: _given(row_of.get(clip)) or names[_plain(clip)] for clip in named}  # as in mug_2 for mug/2.mp4
+    _require_own(row_of, objects)
     cards = _cards(row_of, objects, config)
     contacts, trials = [], Counter[str]()
     for name, path in named.items():
@@ -95,6 +100,7 @@ def list_videos(source: pathlib.Path, config: VideosConfig) -> Catalogue:
         contacts.append(Listed(key=key, name=name, read=functools.partial(_read, path, key, config)))
     files = [file for path in clips for file in ([path] if path.is_file() else numbered(path))]
     unlisted = f"is not listed in {config.labels}"
+    skipped = [Skip(name=name, reason=unlisted) for name in named if rows and name not in row_of]
     return Catalogue(
         source=f"own clips, {config.sensor}",
         licence=config.licence,
@@ -102,7 +108,7 @@ def list_videos(source: pathlib.Path, config: VideosConfig) -> Catalogue:
         annotated=tuple(a for a in ATTRIBUTES if any(a in card.labels for card in cards.values())),
         cards=cards,
         contacts=tuple(contacts),
-        skipped=tuple(Skip(name=name, reason=unlisted) for name in named if rows and name not in row_of),
+        skipped=(*skipped, *_of_other_kinds(source, {*files, *clips})),
         config=dataclasses.asdict(config) | {"labels": None if config.labels is None else config.labels.name},
         identity=fingerprint(
             source,
@@ -121,9 +127,17 @@ def _clips(source: pathlib.Path) -> list[pathlib.Path]:
     return [p for p in (*inside, source) if (p.is_file() and p.suffix.lower() in SUFFIXES) or numbered(p)]
 
 
+def _of_other_kinds(source: pathlib.Path, taken: Container[pathlib.Path]) -> Iterator[Skip]:
+    """Pictures and videos that are read by other programs alone."""
+    for path in sorted(source.rglob("*")):
+        if path not in taken and (mimetypes.guess_type(path.name)[0] or "").startswith(("image/", "video/")):
+            name = path.relative_to(source).as_posix()
+            yield Skip(name=name, reason=f"is not read: must be of {_KINDS}; convert it")
+
+
 def _find(name: str, row: LabelRow, by_name: Mapping[str, Seq[str]], source: pathlib.Path) -> str:
     """The clip that a row names; `by_name` has the clips of every name, with and without the ending of a file."""
-    found = by_name.get(name.strip("/"), ())
+    found = by_name.get(_composed(name).strip("/"), ())
     if len(found) == 1:
         return found[0]
     state = f"stands for {' and '.join(found)}: must be one clip" if found else f"is no clip of {source}"
@@ -131,9 +145,25 @@ def _find(name: str, row: LabelRow, by_name: Mapping[str, Seq[str]], source: pat
     raise LabelsError(f"{row.place}: {CLIP} is {name!r}: {state}; give its path in the folder{near}")
 
 
+def _composed(name: str) -> str:
+    """A name with each accent in its letter: macOS writes them apart."""
+    return unicodedata.normalize("NFC", name)
+
+
 def _given(row: LabelRow | None) -> str:
     """The object that a row names."""
     return "" if row is None else row.cells.get(ID, "")
+
+
+def _require_own(row_of: Mapping[str, LabelRow], objects: Mapping[str, str]) -> None:
+    """Refuse a clip without an object that would become the object of another line."""
+    given = {_given(row) for row in row_of.values()}
+    for clip, row in row_of.items():
+        if not _given(row) and objects[clip] in given:
+            raise LabelsError(
+                f"{row.place}: {CLIP} {clip!r} has no {ID} and would be {objects[clip]!r}, the object of another line: "
+                f"must be one of its own; give it an {ID}"
+            )
 
 
 def _plain(clip: str) -> str:
@@ -164,7 +194,8 @@ def _cards(row_of: Mapping[str, LabelRow], objects: Mapping[str, str], config: V
                 "each; correct one of the lines"
             )
         cards.setdefault(name, card)
-    new = [name for name, card in cards.items() if card.labels and card.split == "unlabelled"]
+    told = {objects[clip] for clip, row in row_of.items() if row.cells.get(SPLIT)}
+    new = [name for name, card in cards.items() if card.labels and name not in told]
     least = 1 / len(new) if len(new) > 2 else 0.0
     shares = {share: max(x, least) if (x := getattr(config, share)) else 0.0 for share in ("val_share", "test_share")}
     splits = split_by_name(new, **shares)

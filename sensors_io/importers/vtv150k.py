@@ -19,7 +19,7 @@ from sensors_io.importers.pictures import film, natural, nominal_ns
 from sensors_io.importers.video import read_video
 from sensors_io.schema import ContactKey
 
-_NAME = re.compile(r"([A-Za-z0-9][A-Za-z0-9_.\-]*)_(\d+)")
+_NAME = re.compile(r"([A-Za-z0-9][A-Za-z0-9_.\-]*)_(\d{1,9})")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -35,7 +35,7 @@ def list_vtv150k(source: pathlib.Path, config: VTVConfig) -> Catalogue:
     Raises:
       ImportSourceError: no .mp4 there.
     """
-    videos = sorted(source.glob("*.mp4"), key=natural)
+    videos = sorted((path for path in source.glob("*") if path.suffix.lower() == ".mp4"), key=natural)
     require_files(source, videos, "<object>_<n>.mp4")
     named = [(path, match) for path in videos if (match := _NAME.fullmatch(path.stem))]
     skipped = [Skip(name=p.name, reason="is not named <object>_<n>") for p in videos if not _NAME.fullmatch(p.stem)]

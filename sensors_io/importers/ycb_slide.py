@@ -40,7 +40,7 @@ def list_ycb_slide(source: pathlib.Path, config: ImportConfig) -> Catalogue:
     require_files(source, slides, "<object>/dataset_<k>/frames/frame_<7 digits>.jpg")
     contacts, skipped, pictures = [], [], []
     for slide in slides:
-        paths, number = numbered(slide / "frames"), re.fullmatch(r"dataset_(\d+)", slide.name)
+        paths, number = numbered(slide / "frames"), re.fullmatch(r"dataset_(\d{1,9})", slide.name)
         if number is None or not paths:
             skipped.append(
                 Skip(name=f"{slide.parent.name}/{slide.name}", reason="holds no frames/frame_<7 digits>.jpg")

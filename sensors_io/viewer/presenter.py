@@ -56,6 +56,7 @@ class Channel:
         self.sample: Sample | None = None
         self.drift: Drift | None = None
         self.flags = Flag.NONE
+        self.refused = ""
 
     @property
     def name(self) -> str:
@@ -103,6 +104,8 @@ class Channel:
             listed["age when shown"] = f"{age_ms:.0f} ms"
         names = [str(flag.name).lower().replace("_", " ") for flag in Flag if flag & self.flags]
         listed["flags"] = ", ".join(names) or "none"
+        if self.refused:
+            listed["fields"] = self.refused
         if self.drift is not None:
             listed["background drift"] = f"{self.drift.rms:.1f} grey levels"
         return listed
@@ -114,7 +117,9 @@ class Channel:
         if frame is None or frame.ndim != 3:
             return sample
         touched = self._background.looks_touched(frame)
-        if self._extractor is not None:
+        if self._extractor is not None and frame.shape != (rest := self._extractor.background).shape:
+            self.refused = f"none: pictures are {frame.shape[:2]}, the gel at rest is {rest.shape[:2]}; crop both alike"
+        elif self._extractor is not None:
             fields = self._extractor.read(frame)
             found = {name: a[0] for name, a in fields.arrays().items() if a is not None and name != "flags"}
             self.flags |= Flag(int(fields.flags[0]))

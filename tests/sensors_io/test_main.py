@@ -146,6 +146,11 @@ def test_a_picture_that_there_is_not_is_one_line(run, tmp_path, monkeypatch, arg
         (["list", "/dev/zero"], "records is /dev/zero: must be a file or a folder, not a pipe or a device"),
         (["extract", "/dev/zero", "--background", "b", "--out", "o"], "inputs is /dev/zero: must be a file"),
         (["label", "r", "--labels", "/dev/zero", "--annotator", "a"], "labels is /dev/zero: must be a file"),
+        (
+            ["geometry", "b", "--background", __file__, *BOARD, "--out", __file__],
+            f"out is {__file__}: is background as",
+        ),
+        (["extract", __file__, "--background", "b", "--out", __file__], f"out is {__file__}: is inputs as well"),
     ],
 )
 def test_a_value_that_nobody_means_is_one_line(run, args, message):

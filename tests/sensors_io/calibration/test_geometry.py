@@ -115,7 +115,14 @@ def test_no_flipped_bit_of_a_geometry_reads_as_another(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "change", [{"radial": [float("nan"), 0]}, {"homography": [[1, 0], [0, 1]]}, {"size_px": ["a", 1]}]
+    "change",
+    [
+        {"radial": [float("nan"), 0]},
+        {"homography": [[1, 0], [0, 1]]},
+        {"homography": [[0] * 3] * 3},
+        {"size_px": ["a", 1]},
+        {"size_px": [0, 8]},
+    ],
 )
 def test_a_file_of_another_geometry_is_named(tmp_path, change):
     path = tmp_path / "g.json"

@@ -46,6 +46,10 @@ def test_labels_come_from_the_table_and_everything_else_stays(root):
     np.testing.assert_array_equal(block.view, before.objects["object_0"].view)
     assert (after.objects["object_2"].labels, after.objects["object_2"].split) == ({}, "train")
     assert after.objects["object_1"].split == "unlabelled"
+    assert label(root, "object_id,roughness,split\nobject_0,1,\nobject_1,1,unlabelled\n") == 0
+    again = RecordStore(root).objects
+    assert again["object_0"].labels == {"hardness": 2, "material": 7, "roughness": 1}
+    assert again["object_1"].split == "unlabelled"
     assert list(after.objects) == list(before.objects)
     assert after.contacts == before.contacts
     assert after.digest != digest  # or what was trained on the old labels would be found again

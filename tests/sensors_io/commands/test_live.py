@@ -18,6 +18,7 @@ from sensors_io.calibration.geometry import CameraGeometry
 from sensors_io.offsets import Offset, Offsets
 from sensors_io.poses import ForceZero
 from sensors_io.records import RecordStore
+from tests.sensors_io.fields.test_extract import calibration
 
 ROOT = pathlib.Path(__file__).resolve().parents[3]
 
@@ -171,6 +172,10 @@ def test_view_extracts_fields_of_a_camera(tmp_path, capsys):
     args = ["view", "--port", "0", "--seconds", "0.3", "--background", gelslam / "background.png", "replay"]
     assert cli.main([*map(str, args), "--path", str(gelslam), "--seconds", "30"]) == 0
     assert "not shown: depth_mm: without a calibration" in capsys.readouterr().out
+    calibration(np.zeros((8, 8, 3), np.uint8)).save(tmp_path / "x.npz")
+    args[-1:] = ["--calibration", tmp_path / "x.npz", "replay"]
+    assert cli.main([*map(str, args), "--path", str(gelslam)]) == 1
+    assert "calibration is for 'x', the pictures are of 'gelsight_mini'" in capsys.readouterr().err
 
 
 def test_devices_says_what_is_absent(capsys):

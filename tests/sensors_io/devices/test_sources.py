@@ -9,9 +9,11 @@ from sensors_io.devices.errors import DeviceNotFoundError, StreamEndedError
 from sensors_io.devices.replay import Disconnect, Faults, ReplayConfig
 from sensors_io.devices.scene import SceneDeviceConfig
 from sensors_io.devices.scene_source import SceneSource
+from sensors_io.devices.sources import RecordedContact
 from sensors_io.scenes.config import SceneConfig
 from tests.sensors_io import fakes as records
 from tests.sensors_io.checks import refused
+from tests.sensors_io.importers.films import cut, picture
 
 
 def everything(device):
@@ -25,15 +27,15 @@ def everything(device):
 
 
 def test_a_folder_of_pictures_at_its_rate(tmp_path):
-    for n in range(3):
+    for n in (9, 10, 11):
         cv2.imwrite(str(tmp_path / f"{n}.png"), np.full((4, 5, 3), (n, 0, 0), np.uint8))
     (tmp_path / "notes.txt").write_text("no picture")
     samples = everything(ReplayConfig(path=tmp_path, rate_hz=50).open(JumpingClock()))
-    assert [s.frame[0, 0].tolist() for s in samples] == [[0, 0, n] for n in range(3)]
+    assert [s.frame[0, 0].tolist() for s in samples] == [[0, 0, n] for n in (9, 10, 11)]
     assert [s.host_time_ns for s in samples] == [0, 20_000_000, 40_000_000]
     again = everything(ReplayConfig(path=tmp_path, rate_hz=50, seconds=0.2).open(JumpingClock()))
     assert [s.index for s in again] == list(range(10))
-    assert [s.frame[0, 0, 2] for s in again] == [n % 3 for n in range(10)]
+    assert [s.frame[0, 0, 2] for s in again] == [9 + n % 3 for n in range(10)]
 
 
 def test_a_contact_of_records_with_all_of_its_arrays(tmp_path):
@@ -68,6 +70,9 @@ def test_nothing_to_replay_is_named(tmp_path):
     for name, said in (("a.avi", "does not open as a video"), ("b.png", "cannot be decoded")):
         (tmp_path / name).write_bytes(b"broken")
         refused(DeviceNotFoundError, said, replayed, tmp_path / name if name == "a.avi" else tmp_path)
+    refused(DeviceNotFoundError, r"\(is cut off\)", replayed, cut(picture(tmp_path / "folder" / "a.png")).parent)
+    source = RecordedContact(path=records.write(tmp_path / "records", 1), contact=1)
+    refused(DeviceNotFoundError, "contact is 1: must be < 1", list, source.samples())
 
 
 def test_faults_are_checked():

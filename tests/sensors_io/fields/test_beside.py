@@ -65,6 +65,8 @@ def test_fields_lie_beside_the_pictures(tmp_path):
     assert encode_sequence(old["xense"]) == encode_sequence(new["xense"])
     np.testing.assert_array_equal(old["gelsight_mini"].frames, new["gelsight_mini"].frames)
     mini = new["gelsight_mini"]
+    fields_beside(job(records, rows=10**6), tmp_path / "large")  # never enlarged
+    assert RecordStore(tmp_path / "large").contact(1)["gelsight_mini"].depth_mm.shape[1:] == SHAPE
     whole = Extractor(bare(), 0.1, CALIBRATION).extract(mini.frames).depth_mm
     halved = np.stack([cv2.resize(d, (SHAPE[1] // 2, SHAPE[0] // 2), interpolation=cv2.INTER_AREA) for d in whole])
     np.testing.assert_allclose(mini.depth_mm, halved, atol=5e-4)
@@ -157,6 +159,7 @@ def test_a_calibration_serves_pictures_of_another_size(tmp_path):
     assert np.abs(found.depth_mm[1] - area).max() < 0.02 * area.max()
     refused(CalibrationError, "must be equal", gels.extractor, recorded(frames=small, mm_per_px=0.1))
     refused(CalibrationError, "same window", gels.extractor, recorded(frames=small[:, :-10]))
+    refused(CalibrationError, "of 'xense': must be equal", gels.extractor, recorded(sensor="xense"))
     lost = {"recording": {"background": "gone.png"}}
     refused(CalibrationError, "gone.png is absent", gels.extractor, recorded(camera=lost))
     own = lambda pitch: RecordedGels(tmp_path, RestGel(rest_frames=1, mm_per_px=pitch))

@@ -152,6 +152,9 @@ def test_pictures_are_read_by_number_and_sizes_must_agree(tmp_path: pathlib.Path
     assert found.chosen(np.array([1])).names == ("10.png",)
     cv2.imwrite(str(tmp_path / "3.png"), np.zeros((9, 8, 3), np.uint8))
     refused(SourceError, "different sizes", read_pictures, [tmp_path], "x")
+    (tmp_path / "4.webm").touch()
+    refused(SourceError, "4.webm: must be one kind", read_pictures, [tmp_path], "x")
+    refused(SourceError, "4.webm does not open as a video", read_pictures, [tmp_path / "4.webm"], "x")
 
 
 def test_what_is_no_picture_is_refused(tmp_path: pathlib.Path) -> None:

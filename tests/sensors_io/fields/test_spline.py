@@ -41,6 +41,14 @@ def test_contradicting_points_are_taken_out_and_no_others():
     assert np.flatnonzero(ThinPlate(POINTS).inconsistent(field, EVERY, 2.0)).tolist() == [4, 20]
 
 
+def test_too_few_points_contradict_nothing():
+    """Noise in place of markers; the energy of fewer than three has no inverse."""
+    square = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [10.0, 10.0]])
+    for count in range(4):
+        found = np.arange(4) < count
+        assert not ThinPlate(square, 1e-3).inconsistent(DISPLACEMENT[:4], found, 1.0).any()
+
+
 def test_leave_one_out_is_that_of_a_fit_without_the_point():
     spline, lost = ThinPlate(POINTS), EVERY.copy()
     lost[9] = False

@@ -65,6 +65,19 @@ def test_what_is_left_out_is_reported(tmp_path):
     assert set(store.objects) == {"object_0", "object_1"}
 
 
+def test_a_contact_that_no_record_can_hold_costs_no_other(tmp_path):
+    def read():
+        return Taken(sequences=(fakes.sequence(0, depth_mm=np.full((12, 5, 6), 40, np.float32)),))
+
+    key = ContactKey(object_id="object_3", site=0, motion="free", trial=0)
+    listing = catalogue()
+    broken = Listed(key=key, name="deep", read=read)
+    cards = {**listing.cards, "object_3": fakes.card(3)}
+    report, store = imported(dataclasses.replace(listing, cards=cards, contacts=(broken, *listing.contacts)), tmp_path)
+    assert (report.contacts, set(store.objects)) == (8, {"object_0", "object_1", "object_2"})
+    assert "depth_mm reaches 40: int16 carries at most" in {s.name: s.reason for s in report.skipped}["deep"]
+
+
 @pytest.mark.parametrize("stop", [1, 2, 5, 6, 7, 9])
 def test_an_interrupted_import_reports_as_if_it_had_not_been(tmp_path, stop):
     def interrupt(done, total):

@@ -57,8 +57,9 @@ def test_rows_without_a_force_or_a_picture_are_counted(tmp_path):
     rows += ["records/sphere/tactile/background.png,,0 0 0 0 0 0\n", row(root, 6000, "0 0 -2 0 0 0")]
     picture(elsewhere := tmp_path / "sphere" / "tactile" / "7000.png", 0)
     rows.append(f"{elsewhere},,0 0 -2 0 0 0\n")
+    rows.append(row(root, 10**13, "0 0 -2 0 0 0"))  # beyond 64 bits in ns
     report, store = feel(write(root, *rows), tmp_path / "out")
-    lines = {f"20250414.csv, line {n}" for n in (3, 4, 5, 7, 9)}
+    lines = {f"20250414.csv, line {n}" for n in (3, 4, 5, 7, 9, 10)}
     assert {skip.name for skip in report.skipped} == {*lines, "tactile/5000.png"}
     sequence = store.contact(0)["gelsight_mini"]
     assert sequence.force_n[:, 2].tolist() == [-3, 0, 0, -2]

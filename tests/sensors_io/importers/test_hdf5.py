@@ -235,6 +235,12 @@ def test_a_unit_that_the_file_contradicts_is_refused(tmp_path):
         trial(file.create_group("trials/0"))
     with pytest.raises(ImportSourceError, match=r"states the unit 'm', the mapping 'mm' for depth_mm"):
         imported(tmp_path, mapped(mini={"depth_mm": {"path": "mini/depth", "unit": "mm"}}))
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        file["trials/0/ft/force"].attrs["unit"] = "counts"
+    _, report = imported(tmp_path, mapped())
+    assert [skip.reason for skip in report.skipped] == [
+        "ft/force states the unit 'counts', which is not known: taken for 'N'"
+    ]
 
 
 def test_an_optional_array_may_be_missing_and_a_cut_file_is_named(tmp_path):

@@ -98,12 +98,12 @@ def test_a_mapping_that_says_something_twice_or_names_by_a_list_is_refused(tmp_p
             read_map(write_map(tmp_path, mapped(object_id={"value": value})))
 
 
-@pytest.mark.parametrize("unit", ["μm", "µm", ["mm"], [b"mm", b"mm"]])
-def test_a_stated_unit_is_understood_in_a_list_and_with_either_letter_of_micro(tmp_path, unit):
+@pytest.mark.parametrize("unit", ["μm", "µm", ["mm"], [b"mm", b"mm"], "inch", "N", "nm"])
+def test_a_stated_unit_is_understood_in_a_list_in_other_spellings_and_of_another_quantity(tmp_path, unit):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         trial(file)
         file["mini/depth"].attrs["unit"] = unit
-    with pytest.raises(ImportSourceError, match=r"states the unit '.m', the mapping 'm' for depth_mm"):
+    with pytest.raises(ImportSourceError, match=r"states the unit '.+', the mapping 'm' for depth_mm"):
         imported(tmp_path, mapped() | {"contact": "/"})
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from sensors_io.importers.keep import ImportSourceError
 from sensors_io.importers.physiclear import PhysiclearConfig, import_physiclear, read_labels
-from sensors_io.records import RecordStore
+from sensors_io.records import RecordsExistError, RecordStore
 from sensors_io.schema import ATTRIBUTES, MATERIALS, UNKNOWN
 from tests.sensors_io.checks import refused
 from tests.sensors_io.importers.films import entry, film, folder, labels
@@ -59,6 +59,8 @@ def test_what_cannot_be_read_is_skipped_and_listed(tmp_path):
     assert set(store.objects) == {"ball", "cup"}
     assert len(store) == 3
     assert len(store.meta.notes["report"]["skipped"]) == 7
+    os.utime(videos / "cup_0.avi", ns=(0, 1))  # replaced by another of its size
+    refused(RecordsExistError, "when the source had other files", run, source)
 
 
 def run(source):
@@ -77,6 +79,8 @@ BALL = entry("ball")
         ([BALL | {"object": "a ball"}], "object_id is 'a ball'"),
         ([BALL | {"videos": ["../ball_0.avi"]}], "must be a file name without a directory"),
         ([BALL | {"hardness": "soft"}], "invalid literal"),
+        ([BALL | {"hardness": 1.7}], "ball: hardness is 1.7: must be a whole number or null"),
+        ([BALL | {"bumps": True}], "ball: bumps is True: must be a whole number or null"),
         ([{key: value for key, value in BALL.items() if key != "bumps"}], "'bumps'"),
         ([BALL, entry("ball", videos=0)], "object 'ball' appears twice"),
         ([BALL, entry("cup") | {"videos": ["ball_0.avi"]}], "video 'ball_0.avi' appears twice; splits"),

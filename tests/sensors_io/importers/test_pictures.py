@@ -3,11 +3,20 @@
 import struct
 import zlib
 
+import cv2
 import numpy as np
 import pytest
 
-from sensors_io.importers.keep import Keep
-from sensors_io.importers.pictures import PictureError, natural, numbered, read_picture, read_pictures
+from sensors_io.importers.keep import ImportSourceError, Keep, UnreadableError
+from sensors_io.importers.pictures import (
+    PictureError,
+    below,
+    natural,
+    nominal_ns,
+    numbered,
+    read_picture,
+    read_pictures,
+)
 from tests.sensors_io.checks import refused
 from tests.sensors_io.importers.films import cut, picture
 
@@ -22,6 +31,9 @@ def test_colours_are_rgb_and_a_picture_that_was_cut_off_is_refused(tmp_path, nam
     red, green, blue = image[2, 2].astype(int)
     assert red > 200 > 80 > max(green, blue)
     refused(PictureError, "is cut off", read_picture, cut(path))
+    if name == "a.png":
+        cv2.imwrite(str(path), np.full((24, 32), 800, np.uint16))  # 12 bits: OpenCV would make 3 of 255 of it
+        refused(PictureError, "holds uint16: must hold 8 bits", read_picture, path)
 
 
 def test_lost_pictures_are_named_and_mark_the_frame_behind_them(tmp_path):
@@ -49,6 +61,16 @@ def test_names_are_ordered_by_their_numbers(tmp_path):
         (tmp_path / name).touch()
     assert [path.name for path in numbered(tmp_path)] == ["frame_9.png", "frame_10.png", "frame_100.png"]
     assert numbered(tmp_path / "absent") == []
+    (tmp_path / "a2").mkdir()
+    for name in ("a2/0.2.png", "a2/0.15.png"):
+        (tmp_path / name).touch()
+    refused(ImportSourceError, "a2: 0.2.png and 0.15.png: their order", numbered, tmp_path / "a2")
+    (tmp_path / "a2" / "0.2.png").rename(tmp_path / "a2" / "0.20.png")
+    (tmp_path / "a10").mkdir()
+    (tmp_path / "a10" / "1.png").touch()
+    names = [path.relative_to(tmp_path).as_posix() for path in below(tmp_path, {".png"})]
+    assert names[2:] == ["frame_100.png", "a2/0.15.png", "a2/0.20.png", "a10/1.png"]
+    refused(UnreadableError, "reach 3.33e\\+37, which 64 bits", nominal_ns, np.array([1, 10**30]), 30.0)
     assert natural(tmp_path / "a2b") < natural(tmp_path / "a10b")
     assert natural(tmp_path / "a٢b") < natural(tmp_path / "a10b") < natural(tmp_path / "a10²1")
 

@@ -63,9 +63,13 @@ def test_a_known_push_lies_where_and_as_it_was_made(tmp_path):
 
 
 def test_gaps_of_the_counter_are_flagged_and_counted(tmp_path):
-    _, store = read(write(tmp_path / "in", index=(7, 8, 11, 12, 20)), tmp_path / "out")
+    """The name of the file is of somebody's own making, and the sensor was started anew at the end."""
+    source = write(tmp_path / "in", "my cup_A1", index=(7, 8, 11, 12, 20, 0, 1))
+    (source / "my cup_A1.npz").rename(source / "my cup_A1.NPZ")
+    _, store = read(source, tmp_path / "out")
     sequence = store.contact(0)["tac3d"]
-    assert np.flatnonzero(sequence.flags & int(Flag.TIME_GAP)).tolist() == [2, 4]
+    assert sequence.key.object_id == "my_cup_A1"
+    assert np.flatnonzero(sequence.flags & int(Flag.TIME_GAP)).tolist() == [2, 4, 5]
     assert sequence.camera["missing_frames"] == 9
 
 
@@ -77,6 +81,8 @@ def test_gaps_of_the_counter_are_flagged_and_counted(tmp_path):
         ({"3D_Positions": recording()["3D_Positions"][:, ::-1]}, "points in another order"),
         ({"recvTimestamp": np.arange(2.0)}, r"recvTimestamp has shape \(2,\): must be \(3,\)"),
         ({"3D_ResultantForce": np.full((3, 1, 3), np.inf)}, "no frame of finite values"),
+        ({"3D_ResultantMoment": np.full((3, 1, 3), "7")}, "3D_ResultantMoment holds <U1: must hold numbers"),
+        ({"sendTimestamp": 1e12 + np.arange(3)}, "times in ns: reach 1e\\+21, which 64 bits cannot hold"),
     ],
 )
 def test_another_layout_is_refused(tmp_path, changes, reason):

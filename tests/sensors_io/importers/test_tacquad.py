@@ -43,9 +43,15 @@ def test_a_sensor_that_is_missing_does_not_take_the_others_with_it(source, tmp_p
     shutil.rmtree(source / "data_indoor" / "paper box" / "digit")
     (source / "data_indoor" / "paper box" / "duragel" / "3.png").unlink()
     with (source / "contact_indoor.csv").open("a") as file:
-        file.write("gone,1,3,0,1,2,4\nshort,1\nodd,a,b,c,d,e,f\n")
+        file.write("gone,1,3,0,1,2,4\nshort,1\nodd,a,b,c,d,e,f\nfar,0,1,0,1,0,9999999\n")
     report, store = imported(list_tacquad(source, EVERYTHING), tmp_path / "out")
     assert report.contacts == 3
     assert set(store.contact(0)) == {"gelsight_mini", "duragel"}
-    rows = {"contact_indoor.csv: short,1", "contact_indoor.csv: odd,a,b,c,d,e,f", "data_indoor/gone", "indoor-gone"}
+    rows = {
+        "contact_indoor.csv: short,1",
+        "contact_indoor.csv: odd,a,b,c,d,e,f",
+        "contact_indoor.csv: far,0,1,0,1,0,9999999",
+        "data_indoor/gone",
+        "indoor-gone",
+    }
     assert {skip.name for skip in report.skipped} == {"paper box/digit", "paper box/duragel/3.png", *rows}

@@ -33,6 +33,7 @@ def clips(tmp_path):
     for n in (9, 10, 11):
         picture(root / "sponge" / f"frame_{n}.png", level=10 * n)
     (root / "notes.txt").write_text("no clip")
+    (root / "mug" / "3.wmv").write_text("of a kind that is not read")
     return root
 
 
@@ -51,7 +52,7 @@ def test_clips_become_records_with_the_labels_of_their_table(clips, tmp_path):
     assert store.objects["sponge"].labels == {"hardness": 0, "material": MATERIALS.index("other")}
     assert (store.objects["cube"].split, store.objects["cube"].annotator) == ("train", "me")
     assert sorted(store.objects[name].split for name in ("mug", "sponge", "towel")) == ["test", "train", "val"]
-    assert [skip.name for skip in report.skipped] == ["other.avi"]
+    assert [skip.name for skip in report.skipped] == ["other.avi", "mug/3.wmv"]
     at = next(i for i, key in enumerate(store.contacts) if key.object_id == "sponge")
     frames = store.contact(at)["gelsight_mini"].frames
     assert [int(frame[-1, -1, 0]) for frame in frames] == [90, 100, 110]
@@ -68,6 +69,9 @@ def test_clips_become_records_with_the_labels_of_their_table(clips, tmp_path):
         ("other,a b,1,,,", r"line 7: .*object_id"),
         ("other,x", r"line 7: must have 6 cells; complete it"),
         ("mug/1.avi,x,,,,", r"line 7: clip 'mug/1.avi' appears twice"),
+        ("other,cube,,,,", r"line 6: clip 'cube.avi' has no object_id and would be 'cube'"),
+        ('"\n\nother",x,3,,,', r"line 9: hardness"),
+        ("\n,,,,,\n,,,,,\nother,x,3,,,", r"line 10: hardness"),
         ("mug/1,x,,,,", r"line 7: clip 'mug/1' is mug/1.avi, as in .*keep one line"),
     ],
 )
@@ -99,11 +103,17 @@ def test_rates_and_heights_that_no_clip_has_are_refused(changed):
 
 
 @pytest.mark.parametrize(
-    ("table", "said"), [("clip\n", "has no row"), ("clip,hardness,hardness\na,0,2\n", "each once")]
+    ("table", "said"),
+    [
+        ("clip\n", "has no row"),
+        ("clip,hardness,hardness\na,0,2\n", "each once"),
+        ("clip;hardness\na;0\n", "separated by commas"),
+        ("clip,name\na,\udcfc\n", "write one in UTF-8"),
+    ],
 )
 def test_a_table_that_labels_nothing_or_twice_is_refused(tmp_path, table, said):
     film(tmp_path / "a.avi")
-    (tmp_path / "labels.csv").write_text(table)
+    (tmp_path / "labels.csv").write_bytes(table.encode(errors="surrogateescape"))
     with pytest.raises(LabelsError, match=said):
         list_videos(tmp_path, VideosConfig(sensor="digit", labels=tmp_path / "labels.csv"))
 
@@ -131,7 +141,10 @@ def test_a_clip_that_changed_at_the_same_size_is_not_mixed_in(clips, tmp_path):
 
 
 def test_clips_whose_names_no_key_can_have_are_different_objects(tmp_path):
-    for name in ("杯", "碗", "mug 2", "mug_2"):
+    for name in ("杯", "碗", "mug 2", "mug_2", "mü"):
         (tmp_path / f"{name}.mp4").touch()
     found = [listed.key.object_id for listed in list_videos(tmp_path, VideosConfig(sensor="mini")).contacts]
-    assert sorted(found) == ["clip", "clip_2", "mug_2", "mug_2_2"]
+    assert sorted(found) == ["clip", "clip_2", "m", "mug_2", "mug_2_2"]
+    table = "clip,hardness,split\nmu\u0308,2,unlabelled\n"  # an accent of its own, as macOS writes it
+    (found,) = listed(tmp_path, table).cards.values()
+    assert (found.object_id, found.split) == ("m", "unlabelled")

@@ -40,7 +40,13 @@ def test_damage_is_left_out_by_name(tmp_path):
     (source / DRILL / "dataset_2").mkdir()
     slide(source, 3, 3, times=(0.0, np.nan, 0.2))
     slide(source, 4, 2, times=("a", "b"))
+    slide(source, 5, 2, times=(0.0, 1.7e12))  # ms in place of seconds
     report, store = imported(list_ycb_slide(source, KEEP), tmp_path / "out")
     names = {skip.name.removeprefix(f"{DRILL}/") for skip in report.skipped}
-    assert names == {"dataset_0/frames/frame_0000001.jpg", "dataset_1 0", "dataset_2", "dataset_3 0", "dataset_4 0"}
+    assert names == {
+        "dataset_0/frames/frame_0000001.jpg",
+        "dataset_1 0",
+        "dataset_2",
+        *(f"dataset_{n} 0" for n in (3, 4, 5)),
+    }
     assert store.contact(0)["digit"].flags.tolist() == [0, int(Flag.TIME_GAP)]

@@ -10,6 +10,7 @@ import pytest
 from sensors_io.devices.base import Identity, Sample
 from sensors_io.devices.errors import StaleFrameError, StreamEndedError
 from sensors_io.devices.intake import Counts
+from sensors_io.fields.extract import Extractor
 from sensors_io.schema import Flag
 from sensors_io.viewer.presenter import Channel, Presenter
 from sensors_io.viewer.server import LiveView
@@ -50,7 +51,11 @@ def test_two_sensors_and_a_force_on_one_page(live):
     camera = Watched("gelsight_mini", frame=frame, arrived=50, missing=3)
     skin = Watched("tac3d", {"depth_mm": np.zeros((4, 4)), "flags": np.uint32(Flag.TIME_GAP | Flag.SATURATED)})
     force = Watched("netft", {"force_n": np.array([3.0, 4.0, -2.0])})
-    said = shown(Presenter([Channel(camera), Channel(skin)], force, live), live)
+    larger = Extractor(np.full((60, 80, 3), 90, np.uint8), 0.1)
+    said = shown(Presenter([Channel(camera, larger), Channel(skin)], force, live), live)
+    assert said["tables"]["gelsight_mini"]["fields"].startswith(
+        "none: pictures are (6, 8), the gel at rest is (60, 80)"
+    )
     assert said["panels"] == ["gelsight_mini: camera", "tac3d: depth"]
     assert said["captions"]["tac3d: depth"].startswith("indentation")
     assert said["title"] == "gelsight_mini 7 + tac3d 7"
