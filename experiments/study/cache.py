@@ -32,6 +32,7 @@ NEVER = (
     "touchr1_jax/models/adapted_folder.py",
     "touchr1_jax/models/description_policy.py",
     "touchr1_jax/models/saved_policy.py",
+    "touchr1_jax/models/touch_input.py",
     "touchr1_jax/text/plain_questions.py",
     "touchr1_jax/training/description_tuning.py",
     "touchr1_jax/training/exploration.py",

@@ -44,7 +44,7 @@ def read_question(question: str, attributes: Mapping[str, Sequence[str]]) -> Ask
       attributes: those that can be asked for, with the words of their levels.
 
     Raises:
-      QuestionError: the question names none of them, or several.
+      QuestionError: the question names none of them, several, or compares by both ends of one.
     """
     text = question.lower()
     said = set(re.findall(r"[a-z]+", text))
@@ -68,4 +68,6 @@ def read_question(question: str, attributes: Mapping[str, Sequence[str]]) -> Ask
         *MORE.get(name, ()),
         *LESS.get(name, ()),
     }
+    if comparing and said & {*MORE.get(name, ())} and said & {*LESS.get(name, ())}:
+        raise QuestionError(f"question is {question!r}: it names both ends of {name}; ask as in 'Which is softer?'")
     return AskedAttribute(name=name, sign=-sign if said & {"less", "least"} else sign, compares=bool(comparing))

@@ -116,6 +116,12 @@ def test_plain_arrays_are_enough_and_misfits_are_named(asked):
         (TouchInput(frames=frames, view=np.zeros((9, 9), np.uint8)), r"view is uint8\[9, 9\]: must be RGB"),
         ({"tac3d": np.zeros((3, 0, 0, 3), np.uint8)}, r"uint8\[3, 0, 0, 3\]: must be uint8"),
         ({"tac3d": 3}, r"must be uint8 \[F, H, W, 3\]"),
+        (frames["tac3d"], "frames is ndarray: must name its sensor"),
+        ({"tac3d": [np.zeros((4, 4, 3), np.uint8), np.zeros((5, 4, 3), np.uint8)]}, "parts must have one shape"),
+        ({**frames, 3: frames["tac3d"]}, r"frames are of \['3'\]"),
+        (TouchInput(frames=frames, force_n={"tac3d": np.full((3, 3), 1e300)}), "must be finite numbers"),
+        (TouchInput(frames=frames, force_n={"tac3d": np.full((3, 3), "1")}), "must be finite numbers"),
+        (TouchInput(frames=frames, index={"tac3d": np.arange(3) + 2**40}), "whole numbers ≥ 0"),
     ):
         with pytest.raises(QuestionError, match=message):
             asked.ask(wrong, "How hard is it?")

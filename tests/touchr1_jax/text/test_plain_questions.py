@@ -30,7 +30,11 @@ def test_the_attribute_is_found(question, name, sign, compares):
 
 @pytest.mark.parametrize(
     ("question", "message"),
-    [("How heavy is it?", "names no attribute; ask for hardness, rou"), ("hard or rough?", "hardness and roughness")],
+    [
+        ("How heavy is it?", "names no attribute; ask for hardness, rou"),
+        ("hard or rough?", "hardness and roughness"),
+        ("Which of the soft objects is harder?", "both ends of hardness"),
+    ],
 )
 def test_other_questions_are_answered_by_what_can_be_asked(question, message):
     with pytest.raises(QuestionError, match=message):
