@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.core import runs, watchers
+from experiments.core import watchers
 from experiments.core.artifacts import read_json
 from experiments.core.runner import Experiment, main, parse, run_experiment
 from tests.experiments.fakes import coin
@@ -125,15 +125,6 @@ def test_only_a_run_that_computes_becomes_the_latest(capsys):
     assert Path("runs/coin/latest").resolve() == latest
 
 
-def test_a_run_directory_serves_one_process_at_a_time(monkeypatch, capsys):
-    monkeypatch.setenv("COIN_CRASHES", "1")
-    with pytest.raises(RuntimeError):
-        run("coin", "--crash-at", "1")
-    with runs.locked(directories()[0]):
-        assert run("coin", "--crash-at", "1") == 1
-    assert "another process" in capsys.readouterr().err
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Learning:
     algorithm: AnyAlgorithm = Paper()
@@ -146,9 +137,6 @@ class LearningConfig:
     grpo: Learning = Learning()
 
 
-LEARNING = Experiment(name="learning", config=LearningConfig(), run=coin.run)
-
-
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
@@ -159,7 +147,8 @@ LEARNING = Experiment(name="learning", config=LearningConfig(), run=coin.run)
     ],
 )
 def test_options_of_a_choice_stand_anywhere(arguments, expected):
-    command = parse(LEARNING, arguments.split(), "about")
+    learning = Experiment(name="learning", config=LearningConfig(), run=coin.run)
+    command = parse(learning, arguments.split(), "about")
     assert command.config.grpo.algorithm == expected
 
 

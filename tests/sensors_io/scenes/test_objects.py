@@ -23,8 +23,6 @@ KINDS = ((1, "part"), (2, "graded"))
 SUMS = (698.749806, 758.587112, 921.512811)
 """Sums of all numbers of that object, of the second if it has a part, and of the third if it is graded."""
 
-NEAR_GAP = 0.999  # values come this close to the edge of the gap around a threshold
-
 
 def _numbers(made) -> Iterator[np.ndarray]:
     for value in vars(made).values():
@@ -46,7 +44,7 @@ def test_level_follows_the_thresholds(name: str, latent: float) -> None:
     assert prop.extremes[0] <= value <= prop.extremes[1]
     assert prop.level(value) == sum(value >= t for t in prop.thresholds)
     for threshold in prop.thresholds:
-        assert abs(np.log(value / threshold)) >= NEAR_GAP * np.log(prop.gap) / 2
+        assert abs(np.log(value / threshold)) >= 0.999 * np.log(prop.gap) / 2  # no value lies in the gap
 
 
 @pytest.mark.parametrize("name", ALL)
