@@ -20,7 +20,7 @@ from sensors_io.devices.errors import (
 )
 from sensors_io.devices.intake import Intake
 from sensors_io.devices.reader import Pump, Reader, ReaderConfig
-from sensors_io.devices.replay import Faults, Replay
+from sensors_io.devices.replay import Disconnect, Faults, Replay
 from tests.sensors_io.checks import refused
 from tests.sensors_io.devices.fakes import MS, Ramp, Scripted, sample
 
@@ -153,6 +153,22 @@ def test_device_stamps_are_mapped_to_the_hosts_clock():
     script = [sample(i, time_ms=1000 + 10 * i + late, device_time_ns=10 * i * MS) for i, late in enumerate((4, 0, 9))]
     times = [s.host_time_ns // MS for s in drain(pumped(Scripted(script)))]
     assert times == [1004, 1010, 1020]
+
+
+@pytest.mark.parametrize("capacity", [5000, 7])
+def test_every_injected_fault_is_counted(capacity):
+    clock = JumpingClock()
+    away = Disconnect(at_s=3, for_s=1.0), Disconnect(at_s=7, for_s=0.2)
+    faults = Faults(drop_share=0.02, duplicate_share=0.01, jitter_s=0.002, disconnects=away, seed=4)
+    replay = Replay(Ramp(50), seconds=20, faults=faults, clock=clock)
+    truth, counts = replay.truth, pumped(replay, capacity=capacity, clock=clock).counts
+    assert truth.produced == 2000 == truth.given + truth.dropped + truth.away
+    assert counts.missing == truth.dropped + truth.away - truth.unseen
+    assert counts.duplicates == truth.duplicated > 0
+    assert counts.disconnects == counts.reconnects == truth.disconnects == 2
+    assert counts.arrived == truth.given + truth.duplicated
+    assert counts.missing_away >= truth.away
+    assert counts.unaccounted == 0
 
 
 def test_a_thread_reads_all_and_a_block_left_early_stops_it():
