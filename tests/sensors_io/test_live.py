@@ -1,4 +1,4 @@
-"""A data set that is made when it is asked for gives the clips of the same set on disk, resumes, and fails by name."""
+"""A data set that is made when it is asked for gives the clips of the same set on disk."""
 
 import numpy as np
 

@@ -10,9 +10,17 @@ import pytest
 
 from experiments.core.artifacts import write_text
 from experiments.core.look import PALETTE, SYMBOLS
-from experiments.core.report import MOST_BYTES, is_best, pieces, webp, word_columns, write_report
+from experiments.core.report import (
+    MOST_BYTES,
+    is_best,
+    pieces,
+    settings_in_words,
+    webp,
+    word_columns,
+    write_report,
+)
 from experiments.core.results import Comparison, Estimate, Picture, Results, Trace, named_table
-from experiments.core.text import MEANINGLESS, SMOKE, bounds, number
+from experiments.core.text import MEANINGLESS, SMOKE, bounds, number, preset_in_words
 from tests.experiments.core.test_results import FAST, SLOW
 from tests.experiments.fakes import coin
 from touchr1_jax.bench.metrics import METRICS
@@ -227,6 +235,16 @@ def test_requirements_without_notes_have_no_column_for_them(tmp_path, results):
 def test_the_sign_of_zero_shows_in_an_interval_alone():
     assert [number(x, spec) for x, spec in ((-0.04, "+.1f"), (-0.04, ".1f"), (-0.06, ".1f"))] == ["+0.0", "0.0", "−0.1"]
     assert bounds(-0.04, 0.04, "+.1f") == "[−0.0, +0.0]"
+
+
+def test_a_preset_is_told_in_words():
+    changed = "paper with prompts=4, buckets=(8, 12), enumerated=none, mask_truncated=True, segment_credit=False"
+    words = "paper with 4 prompts a step, buckets (8, 12), enumerated none, mask truncated, no segment credit"
+    assert [preset_in_words(preset) for preset in ("paper", changed)] == ["paper", words]
+    assert settings_in_words({"preset": changed, "preset of soft": changed}) == {
+        "preset": words,
+        "preset of soft": words,
+    }
 
 
 def test_arms_beyond_the_colours_have_other_symbols(tmp_path, results):
