@@ -9,7 +9,7 @@ import pytest
 
 from experiments.active.saved import save_explorer
 from experiments.ask.command import run_asking
-from experiments.ask.exploring import unseen_object
+from experiments.ask.exploring import request, unseen_object
 from experiments.core.errors import DataError
 from tests.experiments.active.explorers import CONTACTS, touching
 from touchr1_jax.text.turns import QUESTIONS_OF_TOUCH
@@ -75,6 +75,10 @@ def test_a_generated_object_answers_by_itself(saved, tmp_path, capsys):
 def test_what_it_cannot_take_is_named(saved, tmp_path, capsys, arguments):
     assert ask(saved, tmp_path, *arguments) == 1
     assert "a policy that chooses its touches" in capsys.readouterr().err
+
+
+def test_requests_are_words_for_a_person():
+    assert request(("tac3d", "slide_x", 10.0)) == "slide it along x with the tac3d, 10 N"
 
 
 def test_generated_objects_are_none_of_training():

@@ -247,6 +247,13 @@ def test_a_preset_is_told_in_words():
     }
 
 
+def test_a_heading_keeps_its_hyphen_on_the_line_and_an_empty_answer_is_told(tmp_path, results):
+    empty = dataclasses.replace(coin.example(), trace="", slots=())
+    page = write(tmp_path, dataclasses.replace(results, examples=(empty,)))
+    assert '<th><span class="whole">H-Acc</span><span' in page
+    assert "an empty answer" in page
+
+
 def test_arms_beyond_the_colours_have_other_symbols(tmp_path, results):
     arms = {f"arm_{i}": row(60.0) for i in range(len(PALETTE) + 1)}
     page = write(tmp_path, dataclasses.replace(results, arms=arms, comparisons=(), baselines={"sft": row(1.0)}))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.core import watchers
+from experiments.core import runs, watchers
 from experiments.core.artifacts import read_json
 from experiments.core.runner import Experiment, main, parse, run_experiment
 from tests.experiments.fakes import coin
@@ -123,6 +123,15 @@ def test_only_a_run_that_computes_becomes_the_latest(capsys):
     assert "correct it" in capsys.readouterr().err
     assert len(directories()) == 2
     assert Path("runs/coin/latest").resolve() == latest
+
+
+def test_a_run_directory_serves_one_process_at_a_time(monkeypatch, capsys):
+    monkeypatch.setenv("COIN_CRASHES", "1")
+    with pytest.raises(RuntimeError):
+        run("coin", "--crash-at", "1")
+    with runs.locked(directories()[0]):
+        assert run("coin", "--crash-at", "1") == 1
+    assert "another process" in capsys.readouterr().err
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
