@@ -150,3 +150,14 @@ def test_a_touch_that_does_not_exist_changes_nothing():
     assert not np.allclose(found[0], found[1])
     features = policy.features(jax.tree.map(lambda leaf: leaf[0], params), jnp.asarray(two))
     assert (features.touch_time[:, 0, 1:] == -1).all()
+
+
+@pytest.mark.long
+def test_several_touches_of_an_object_are_one_question(trained, tmp_path):
+    videos, learned = trained
+    config = dataclasses.replace(CONFIG, shape=dataclasses.replace(SHAPE, contacts=2), tune=TuneConfig(steps=2))
+    context = run_context(tmp_path)
+    several = learn(config, videos, learned.auxiliary, 0, context, "policy")
+    context.close()
+    found = answer_log_probs(several, videos, [np.array([0, 1]), np.array([2])])
+    assert found.shape == (2, 27)
