@@ -1,7 +1,4 @@
-"""Pages in a real browser, as wide as a desk, a tablet and a telephone: nothing is cut, missing or without a name.
-
-`make test-slow` runs every experiment at its smallest scale for this, which takes about an hour on two cores.
-"""
+"""Pages in a real browser, as wide as a desk, a tablet and a telephone: nothing is cut, missing or without a name."""
 
 import html
 import json

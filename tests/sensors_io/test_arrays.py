@@ -1,7 +1,6 @@
 """Arrays of files from outside: equal to NumPy's, or refused."""
 
 import contextlib
-import io
 
 import numpy as np
 import pytest
@@ -53,15 +52,3 @@ def test_every_flipped_bit_of_an_archive_is_named_or_harmless(tmp_path, save):
         path.write_bytes(flipped)
         with contextlib.suppress(ArraysError):
             np.testing.assert_equal(load_arrays(path), arrays)
-
-
-def test_no_flip_of_a_byte_raises_anything_else(tmp_path):
-    stream = io.BytesIO()
-    np.savez_compressed(stream, a=np.arange(9.0))
-    whole = stream.getvalue()
-    for i in range(len(whole)):
-        (tmp_path / "a.npz").write_bytes(whole[:i] + bytes([whole[i] ^ 255]) + whole[i + 1 :])
-        try:
-            load_arrays(tmp_path / "a.npz")
-        except ArraysError:
-            continue

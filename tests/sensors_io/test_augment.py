@@ -95,31 +95,29 @@ def test_elements_are_drawn_as_often_as_is_asked():
     assert {draw_symmetry(AugmentConfig(), rng) for _ in range(50)} == {Symmetry()}
 
 
-class TestExposure:
-    def test_a_stop_doubles_and_white_stays_white(self):
-        highest = types.SimpleNamespace(uniform=lambda low, high, size=None: np.full(size or (), high))
-        image = np.array([10, 100, 200, 0], np.uint8)[None, None, :, None].repeat(3, -1)
-        assert jitter_exposure(image, AugmentConfig(), highest) is image
-        brighter = jitter_exposure(image, AugmentConfig(exposure_stops=1), highest)
-        np.testing.assert_array_equal(brighter[0, 0, :, 0], [20, 200, 255, 0])
+def test_a_stop_doubles_and_white_stays_white():
+    highest = types.SimpleNamespace(uniform=lambda low, high, size=None: np.full(size or (), high))
+    image = np.array([10, 100, 200, 0], np.uint8)[None, None, :, None].repeat(3, -1)
+    assert jitter_exposure(image, AugmentConfig(), highest) is image
+    brighter = jitter_exposure(image, AugmentConfig(exposure_stops=1), highest)
+    np.testing.assert_array_equal(brighter[0, 0, :, 0], [20, 200, 255, 0])
 
 
-class TestDropout:
-    @hypothesis.given(
-        st.lists(st.lists(st.booleans(), min_size=5, max_size=5), min_size=1), st.floats(0, 1), st.integers(0, 99)
-    )
-    def test_some_of_the_present_frames_stay_and_the_first_one_always(self, present, share, seed):
-        present = np.array(present)
-        kept = draw_kept(present, AugmentConfig(frame_dropout=share), np.random.default_rng(seed))
-        assert not (kept & ~present).any()
-        rows = np.flatnonzero(present.any(1))
-        assert kept[rows, present[rows].argmax(1)].all()  # what the change of all others is measured against
+@hypothesis.given(
+    st.lists(st.lists(st.booleans(), min_size=5, max_size=5), min_size=1), st.floats(0, 1), st.integers(0, 99)
+)
+def test_some_of_the_present_frames_stay_and_the_first_one_always(present, share, seed):
+    present = np.array(present)
+    kept = draw_kept(present, AugmentConfig(frame_dropout=share), np.random.default_rng(seed))
+    assert not (kept & ~present).any()
+    rows = np.flatnonzero(present.any(1))
+    assert kept[rows, present[rows].argmax(1)].all()  # what the change of all others is measured against
 
-    def test_the_share_is_kept(self):
-        kept = draw_kept(np.ones((4, 5000), bool), AugmentConfig(frame_dropout=0.3), np.random.default_rng(0))
-        assert kept.mean() == pytest.approx(0.7, abs=0.02)
-        everything = draw_kept(np.ones((4, 9), bool), AugmentConfig(frame_dropout=1), np.random.default_rng(0))
-        assert (everything.sum(1) == 1).all()
+
+@pytest.mark.parametrize(("share", "kept", "error"), [(0.3, 0.7, 0.02), (1, 1 / 5000, 0)])
+def test_the_share_is_dropped_but_for_one_frame(share, kept, error):
+    found = draw_kept(np.ones((4, 5000), bool), AugmentConfig(frame_dropout=share), np.random.default_rng(0))
+    assert found.mean() == pytest.approx(kept, abs=error)
 
 
 def test_bad_options_are_named():

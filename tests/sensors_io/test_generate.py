@@ -16,32 +16,22 @@ from sensors_io.scenes.config import SceneConfig
 from tests.sensors_io import fakes
 
 
-@pytest.fixture
-def asked(monkeypatch):
-    """Fake scenes, and the start of every generation."""
-    starts = []
+def test_all_contacts_are_written_once(tmp_path, monkeypatch):
+    asked, seen, config = [], [], SceneConfig(objects=5, sites=1)
 
     def contacts(config, start, stop):
-        starts.append(start)
+        asked.append(start)
         return ([fakes.sequence(i, "xense"), fakes.sequence(i, "tac3d")] for i in range(start, stop))
 
     monkeypatch.setattr(generate, "object_cards", lambda config: [fakes.card(n) for n in range(config.objects)])
     monkeypatch.setattr(generate, "contacts", contacts)
-    return starts
-
-
-CONFIG = SceneConfig(objects=5, sites=1)
-
-
-def test_all_contacts_are_written_once(tmp_path, asked):
-    seen = []
-    generate.generate_records(CONFIG, tmp_path, progress=lambda *now: seen.append(now))
+    generate.generate_records(config, tmp_path, progress=lambda *now: seen.append(now))
     store = RecordStore(tmp_path)
     assert [key.object_id for key in store.contacts] == [f"object_{n}" for n in range(5)]
     assert store.meta.notes["config"]["objects"] == 5
     assert seen == [(0, 5), (5, 5)]
     with write_lock(tmp_path):  # of a process that uses the same complete records
-        generate.generate_records(CONFIG, tmp_path, progress=lambda *now: seen.append(now))
+        generate.generate_records(config, tmp_path, progress=lambda *now: seen.append(now))
     assert seen[-2:] == [(5, 5), (5, 5)]
     assert asked == [0]
 

@@ -1,9 +1,6 @@
-"""A data set that is made when it is asked for gives the clips of the same set on disk, resumes, and fails by name."""
-
-import itertools
+"""A data set that is made when it is asked for gives the clips of the same set on disk."""
 
 import numpy as np
-import pytest
 
 from sensors_io import live
 from sensors_io.live import LiveScenes
@@ -13,41 +10,22 @@ from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import CLIP_ARRAYS
 from tests.sensors_io import fakes
 
-CONFIG = SceneConfig(objects=6, sites=1)
-CLIP = ClipConfig(frames=3, image_px=8, view_px=8, sensors=("xense", "tac3d"))
 
-
-@pytest.fixture
-def scenes(monkeypatch):
-    """Fake scenes that are made on demand."""
-
+def test_clips_are_those_from_disk(monkeypatch, tmp_path):
     def made(config, i):
         return [fakes.sequence(i // 2, sensor, trial=i % 2) for sensor in ("xense", "tac3d")]
 
     monkeypatch.setattr(live, "make_contact", made)
     monkeypatch.setattr(live, "contact_key", lambda config, i: made(config, i)[0].key)
     monkeypatch.setattr(live, "object_cards", lambda config: [fakes.card(n) for n in range(config.objects)])
-    return LiveScenes(CONFIG)
-
-
-def _batches(store, **options):
-    return clip_batches(store, range(6), CLIP, batch_size=2, seed=5, **options)
-
-
-def test_clips_are_those_from_disk(scenes, tmp_path):
+    scenes = LiveScenes(SceneConfig(objects=6, sites=1))
+    clip = ClipConfig(frames=3, image_px=8, view_px=8, sensors=("xense", "tac3d"))
     fakes.write(tmp_path, 6, sensors=("xense", "tac3d"))
-    fed, read = (list(_batches(store, repeat=False)) for store in (scenes, RecordStore(tmp_path)))
+    order = {"batch_size": 2, "seed": 5, "repeat": False}
+    fed, read = (list(clip_batches(store, range(6), clip, **order)) for store in (scenes, RecordStore(tmp_path)))
     assert len(fed) == len(read) == 3
     for a, b in zip(fed, read, strict=True):
         assert a.keys() == b.keys() == CLIP_ARRAYS.keys() | {"contact"}
         for name in a:
             rounding = {"force_n": 1e-3, "frames": 1}.get(name, 0)  # fields and forces are stored as counts
             np.testing.assert_allclose(a[name].astype(float), b[name].astype(float), atol=rounding, err_msg=name)
-
-
-def test_a_feed_resumes_from_its_state(scenes):
-    feed, again = (iter(_batches(scenes, threads=2)) for _ in range(2))
-    list(itertools.islice(feed, 4))
-    again.set_state(feed.get_state())
-    for _ in range(3):
-        np.testing.assert_array_equal(next(again)["contact"], next(feed)["contact"])

@@ -22,6 +22,7 @@ from sensors_io.records import RecordWriter
 from tests.sensors_io import fakes
 from tests.sensors_io.importers.films import entry, folder
 
+GELSLAM = pathlib.Path(__file__).resolve().parents[1] / "data" / "gelslam"
 LAYOUTS = "octopi touch-and-go tvl tacquad feelanyforce ycb-slide tac3d estimate-modulus"
 
 
@@ -91,26 +92,6 @@ def test_generate_hands_its_options_on(run, tmp_path, monkeypatch):
     assert "2 sequences" in out
 
 
-@pytest.mark.parametrize(
-    ("args", "message"),
-    [
-        (["list", "nowhere"], "MissingIndexError: nowhere has no index.json"),
-        (["import", "physiclear", "nowhere", "--out", "out"], "ImportSourceError: nowhere/labels.json is missing"),
-        *(
-            (["import", *name.split(), "nowhere", "--out", "out"], "ImportSourceError: nowhere is no directory: ")
-            for name in [*LAYOUTS.split(), "vtv150k --sensor digit"]
-        ),
-    ],
-)
-def test_known_errors_are_one_line(run, tmp_path, monkeypatch, args, message):
-    monkeypatch.chdir(tmp_path)
-    status, out, err = run(*args)
-    assert (status, out) == (1, "")
-    assert err.startswith(message)
-    assert len(err.strip().splitlines()) == 1
-
-
-GELSLAM = pathlib.Path(__file__).resolve().parents[1] / "data" / "gelslam"
 REPLAY = ["replay", "--path", str(GELSLAM)]
 BOARD = ["--rows", "7", "--columns", "9", "--pitch-mm", "2", "--out", "o.json"]
 
@@ -133,30 +114,44 @@ def test_a_picture_that_there_is_not_is_one_line(run, tmp_path, monkeypatch, arg
     assert err == "SourceError: nowhere.png is absent: must be a whole picture; replace it\n"
 
 
+EXTRACT = ["extract", "p", "--background", "b", "--out", "o"]
+REST = str(GELSLAM / "background.png")
+GEOMETRY = ["geometry", REST, "--background", REST, "--pitch-mm", "2", "--out", "o.json"]
+NO_DIRECTORY = [[*name.split(), "nowhere"] for name in (*LAYOUTS.split(), "vtv150k --sensor digit")]
+
+
 @pytest.mark.parametrize(
-    ("args", "message"),
+    ("status", "args", "message"),
     [
-        (["extract", "p", "--background", "b", "--out", "o", "--nodes", "0"], "nodes is 0: must be ≥ 4"),
-        (["extract", "p", "--background", "b", "--out", "o", "--mm-per-px", "nan"], "mm_per_px is nan: must be"),
-        (["extract", "p", "--background", "b", "--out", "o", "--smoothing-mm", "inf"], "smoothing_mm is inf: must be"),
-        (["devices", "--tac3d-port", "-1"], "tac3d_port is -1: must lie in 0 … 65535"),
-        (["devices", "--wait-s", "1e300"], "wait_s is 1e+300: must be"),
-        (["view", "--port", "99999", *REPLAY], "port is 99999: must lie in 0 … 65535"),
-        (["view", *REPLAY, "+", "tac3d", "--port", "70000"], "port is 70000: must lie in 0 … 65535"),
-        (["list", "/dev/zero"], "records is /dev/zero: must be a file or a folder, not a pipe or a device"),
-        (["extract", "/dev/zero", "--background", "b", "--out", "o"], "inputs is /dev/zero: must be a file"),
-        (["label", "r", "--labels", "/dev/zero", "--annotator", "a"], "labels is /dev/zero: must be a file"),
+        (1, ["list", "nowhere"], "MissingIndexError: nowhere has no index.json"),
+        (1, ["import", "physiclear", "nowhere", "--out", "o"], "ImportSourceError: nowhere/labels.json is missing"),
+        *((1, ["import", *of, "--out", "o"], "ImportSourceError: nowhere is no directory: ") for of in NO_DIRECTORY),
+        (1, [*GEOMETRY, "--rows", "0", "--columns", "9"], "GeometryError: rows and columns are 0 and 9: must be ≥ 1"),
+        (1, [*GEOMETRY, "--rows", "7", "--columns", "-1"], "GeometryError: rows and columns are 7 and -1: must be"),
+        (2, [*EXTRACT, "--nodes", "0"], "ValueError: nodes is 0: must be ≥ 4"),
+        (2, [*EXTRACT, "--mm-per-px", "nan"], "ValueError: mm_per_px is nan: must be"),
+        (2, [*EXTRACT, "--smoothing-mm", "inf"], "ValueError: smoothing_mm is inf: must be"),
+        (2, ["extract", "/dev/zero", *EXTRACT[2:]], "ValueError: inputs is /dev/zero: must be a file"),
+        (2, ["devices", "--tac3d-port", "-1"], "ValueError: tac3d_port is -1: must lie in 0 … 65535"),
+        (2, ["devices", "--wait-s", "1e300"], "ValueError: wait_s is 1e+300: must be"),
+        (2, ["view", "--port", "99999", *REPLAY], "ValueError: port is 99999: must lie in 0 … 65535"),
+        (2, ["view", *REPLAY, "+", "tac3d", "--port", "70000"], "ValueError: port is 70000: must lie in 0 … 65535"),
+        (2, ["list", "/dev/zero"], "ValueError: records is /dev/zero: must be a file or a folder, not a pipe"),
+        (2, ["label", "r", "--labels", "/dev/zero", "--annotator", "a"], "ValueError: labels is /dev/zero: must be"),
         (
-            ["geometry", "b", "--background", __file__, *BOARD, "--out", __file__],
-            f"out is {__file__}: is background as",
+            2,
+            ["geometry", "same", *GEOMETRY[2:-1], "same", "--rows", "7", "--columns", "9"],
+            "ValueError: out is same: ",
         ),
-        (["extract", __file__, "--background", "b", "--out", __file__], f"out is {__file__}: is inputs as well"),
+        (2, ["extract", "same", *EXTRACT[2:-1], "same"], "ValueError: out is same: is inputs as well"),
     ],
 )
-def test_a_value_that_nobody_means_is_one_line(run, args, message):
-    status, out, err = run(*args)
-    assert (status, out) == (2, "")
-    assert err.startswith(f"ValueError: {message}")
+def test_known_errors_are_one_line(run, tmp_path, monkeypatch, status, args, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "same").touch()
+    found, out, err = run(*args)
+    assert (found, out) == (status, "")
+    assert err.startswith(message)
     assert len(err.strip().splitlines()) == 1
 
 
@@ -168,15 +163,6 @@ def test_a_replay_refuses_numbers_while_the_command_is_read(run, capsys, option,
         run("view", *REPLAY, option, value)
     assert stop.value.code == 2
     assert f"{option[2:].replace('-', '_')} is {value}" in capsys.readouterr().err
-
-
-def test_a_board_of_no_pins_is_one_line(run, tmp_path):
-    picture = GELSLAM / "background.png"
-    for rows, columns in ((0, 9), (7, -1)):
-        numbers = ("--rows", rows, "--columns", columns, "--pitch-mm", "2", "--out", tmp_path / "o.json")
-        status, _, err = run("geometry", picture, "--background", picture, *numbers)
-        assert status == 1
-        assert err.startswith(f"GeometryError: rows and columns are {rows} and {columns}: must be ≥ 1")
 
 
 @pytest.mark.parametrize("program", ["sensors_io", "experiments", "experiments.bench"])
@@ -237,16 +223,15 @@ def test_an_interrupt_says_how_to_go_on(run, tmp_path, monkeypatch, capsys):
 
 def test_check_looks_at_pictures_where_it_can(run, tmp_path):
     """Real presses of a Mini beside their gel at rest; the other sensors' noise has no background and says so."""
-    gelslam = pathlib.Path(__file__).resolve().parents[1] / "data" / "gelslam"
     names = ("background", "press_12", "press_14", "press_18")
-    frames = np.stack([read_picture(gelslam / f"{name}.png") for name in names])
+    frames = np.stack([read_picture(GELSLAM / f"{name}.png") for name in names])
     fakes.write(tmp_path, 1, sensors=("tac3d",))
     with RecordWriter(tmp_path, meta=fakes.META, resume=True) as writer:
         n = len(frames)
         shown = fakes.sequence(0, length=n, trial=1, frames=frames, camera={"recording": {"background": "rest.png"}})
         writer.write_contact([shown])
         writer.write_contact([fakes.sequence(0, trial=2)])
-    shutil.copy(gelslam / "background.png", tmp_path / "rest.png")
+    shutil.copy(GELSLAM / "background.png", tmp_path / "rest.png")
     status, out, _ = run("check", tmp_path, "--pictures")
     assert status == 0
     looked = out[out.index("flags by the pictures") :]

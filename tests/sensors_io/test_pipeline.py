@@ -209,6 +209,8 @@ class TestClipBatches:
         once = {"shuffle": False, "repeat": False}
         assert [b["contact"].tolist() for b in self.batches(store, **once)] == [[0, 1, 2], [3, 4, 5], [6]]
         assert [len(b["contact"]) for b in self.batches(store, **once, drop_remainder=True)] == [3, 3]
+        shared = self.batches(store, **once, drop_remainder=True, own=[0, 2])
+        assert [b["contact"].tolist() for b in shared] == [[0, 2], [3, 5]]
         some = clip_batches(store, [5, 1], SMALL, batch_size=2, seed=0, **once)
         assert [b["contact"].tolist() for b in some] == [[5, 1]]
 
@@ -230,16 +232,19 @@ class TestClipBatches:
 
     @pytest.mark.parametrize("augment", [None, LIVELY], ids=["plain", "changed"])
     def test_machines_that_share_batches_read_them_together(self, store, augment):
-        """Random changes too are those of the whole batch, and a state of one machine is a state of all."""
+        """Random changes too are those of the whole batch; other machines go on from the state of one."""
         options = {"batch_size": 5, "augment": augment}
         whole = iter(self.batches(store, **options))
-        want = [next(whole) for _ in range(6)]
+        want = [next(whole) for _ in range(7)]
         for own in ([0, 1], [2, 4]):
             part = iter(self.batches(store, own=own, **options))
             for batch in want[:3]:
                 same(next(part), {name: x[own] for name, x in batch.items()})
             part.set_state(iter_state(self.batches(store, **options), 5))
             same(next(part), {name: x[own] for name, x in want[5].items()})
+            other = iter(self.batches(store, own=[3], **options))
+            other.set_state(part.get_state())
+            same(next(other), {name: x[[3]] for name, x in want[6].items()})
 
     @pytest.mark.parametrize("own", [[], [1, 0], [0, 3], [-1]])
     def test_rows_that_a_batch_does_not_have_are_named(self, store, own):
@@ -248,43 +253,17 @@ class TestClipBatches:
         refused(SchemaError, "the last perhaps smaller", self.batches, store, own=[0], repeat=False)
 
 
-def test_readers_that_join_or_leave_change_shares_and_not_the_epoch(store):
-    """1, then 3, then 2 readers share the batches of one epoch: every contact comes once."""
-    config, rows, batch = ClipConfig(image_px=16, view_px=8, frames=2), list(range(6)) * 4, 6
-    seen, state = [], None
-    for readers, batches in ((1, 1), (3, 2), (2, 1)):
-        shares = [range(h * batch // readers, (h + 1) * batch // readers) for h in range(readers)]
-        loads = [clip_batches(store, rows, config, batch_size=batch, seed=3, repeat=False, drop_remainder=True, own=own)
-                 for own in shares]  # fmt: skip
-        iterators = [iter(load) for load in loads]
-        for iterator in iterators:
-            if state is not None:
-                iterator.set_state(state)
-        for _ in range(batches):
-            seen += [int(i) for iterator in iterators for i in next(iterator)["contact"]]
-        state = iterators[-1].get_state()  # states are those of the whole
-    assert sorted(seen) == sorted(rows)
-    whole = clip_batches(store, rows, config, batch_size=batch, seed=3, repeat=False, drop_remainder=True)
-    assert seen == [int(i) for one in whole for i in one["contact"]]
-
-
-def test_a_clip_shows_fields_in_the_place_of_pictures_where_asked():
-    """The same frames, seen as deformation and depth; exposure does not touch them; pictures alone are refused."""
-    config = ClipConfig(frames=4, image_px=8, view_px=6, sensors=("gelsight_mini",), show="fields")
-    recorded = fakes.sequence(0)
-    shown = make_clip({"gelsight_mini": recorded}, fakes.card(0), config)
+def test_a_clip_shows_fields_in_the_place_of_pictures_where_asked(store):
+    """The same frames, seen as deformation and depth; pictures alone are refused."""
+    config = dataclasses.replace(SMALL, sensors=("gelsight_mini",), show="fields")
+    recorded, card = store.contact(0)["gelsight_mini"], store.objects["object_0"]
+    shown = make_clip({"gelsight_mini": recorded}, card, config)
     bare = dataclasses.replace(recorded, frames=None)
-    np.testing.assert_array_equal(shown.frames, make_clip({"gelsight_mini": bare}, fakes.card(0), config).frames)
-    pictures = make_clip({"gelsight_mini": recorded}, fakes.card(0), dataclasses.replace(config, show="pictures"))
+    np.testing.assert_array_equal(shown.frames, make_clip({"gelsight_mini": bare}, card, config).frames)
+    [batch] = clip_batches(store, [0, 1], config, batch_size=2, seed=0, shuffle=False, repeat=False)
+    np.testing.assert_array_equal(batch["frames"][0], shown.frames)
+    pictures = make_clip({"gelsight_mini": recorded}, card, dataclasses.replace(config, show="pictures"))
     assert (shown.frame_index == pictures.frame_index).all()
     assert (shown.frames != pictures.frames).any()
     alone = dataclasses.replace(recorded, depth_mm=None, deformation_mm=None, valid=None)
-    refused(SchemaError, "has no fields, and show", make_clip, {"gelsight_mini": alone}, fakes.card(0), config)
-
-
-def test_batches_read_the_fields_that_they_show(tmp_path):
-    store = RecordStore(fakes.write(tmp_path, 2, sensors=("gelsight_mini",)))
-    config = ClipConfig(frames=4, image_px=8, view_px=6, sensors=("gelsight_mini",), show="fields")
-    [batch] = clip_batches(store, [0, 1], config, batch_size=2, seed=0, shuffle=False, repeat=False)
-    expected = make_clip(store.contact(0), store.objects["object_0"], config)
-    np.testing.assert_array_equal(batch["frames"][0], expected.frames)
+    refused(SchemaError, "has no fields, and show", make_clip, {"gelsight_mini": alone}, card, config)

@@ -9,10 +9,7 @@ import pytest
 from sensors_io.force import ForceError
 from sensors_io.poses import ForceZero, PoseConfig, PoseFinder, fit_poses
 from tests.sensors_io.checks import refused
-
-BIAS, BIAS_M = np.array([1.2, -0.4, 3.0]), np.array([20.0, -5.0, 8.0])
-WEIGHT, CENTRE = 1.5, np.array([2.0, -1.0, 12.0])
-MS = 1_000_000
+from tests.sensors_io.test_force import BIAS, BIAS_M, CENTRE, WEIGHT
 
 
 def turned(count=8, hold_s=1.0, turn_s=0.4, noise_n=0.005, rate_hz=200, seed=0):

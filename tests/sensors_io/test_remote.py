@@ -26,7 +26,7 @@ URL = "memory://bucket/records"
 def cache(tmp_path, monkeypatch):
     """A cache of its own, an empty store, and no waiting."""
     monkeypatch.setenv(remote.CACHE, str(tmp_path / "cache"))
-    monkeypatch.setattr(remote, "_WAITS_S", (0.0,) * 5)
+    monkeypatch.setattr(remote.time, "sleep", lambda wait_s: None)
     store = fsspec.filesystem("memory")
     store.store.clear()
     yield tmp_path / "cache"
@@ -90,18 +90,8 @@ def test_a_copy_has_the_files_of_folders_and_of_a_single_file_nothing(tmp_path):
     assert Mirror("memory://bucket/tree/a/b").files() == {}
 
 
-def test_the_cache_keeps_within_its_bound(records, cache, monkeypatch):
-    assert main(["push", str(records), URL]) == 0
-    most = 3 * max(path.stat().st_size for path in records.glob("contacts-*.arrayrecord"))
-    monkeypatch.setenv(remote.CACHE_GB, str(most / 1e9))
-    monkeypatch.setattr("sensors_io.shards._OPEN", 1)
-    store = RecordStore(URL)
-    for i in [*range(7), *range(7)]:
-        assert store.contact(i)["xense"].key == store.contacts[i]
-        assert sum(path.stat().st_size for path in cache.iterdir()) <= most
-
-
-def test_the_cache_removes_its_own_copies_alone(records, cache, monkeypatch):
+@pytest.mark.parametrize("shards", [3, 0.1])
+def test_the_cache_keeps_within_its_bound_and_removes_its_own_copies_alone(records, cache, monkeypatch, shards):
     """Files of the user, folders and downloads of other processes stay, however old and large they are."""
     assert main(["push", str(records), URL]) == 0
     (cache / "photos").mkdir(parents=True)
@@ -109,11 +99,14 @@ def test_the_cache_removes_its_own_copies_alone(records, cache, monkeypatch):
     for path in others:
         path.write_bytes(bytes(10**5))
         os.utime(path, (1, 1))
-    monkeypatch.setenv(remote.CACHE_GB, "1e-6")
+    largest = max(path.stat().st_size for path in records.glob("contacts-*.arrayrecord"))
+    monkeypatch.setenv(remote.CACHE_GB, f"{shards * largest / 1e9:.9f}")
     monkeypatch.setattr("sensors_io.shards._OPEN", 1)
     store = RecordStore(URL)
-    for i in range(7):
+    for i in [*range(7), *range(7)]:
         assert store.contact(i)["xense"].key == store.contacts[i]
+        own = [path for path in cache.iterdir() if path.is_file() and path not in others]
+        assert sum(path.stat().st_size for path in own) <= max(shards, 1) * largest
     assert all(path.stat().st_size == 10**5 for path in others)
 
 
@@ -182,7 +175,7 @@ def test_failures_that_pass_change_nothing(records, failing, caplog):
     failing(3, OSError("SlowDown"))
     assert main(["push", str(records), URL]) == 0
     assert same(RecordStore(records), RecordStore(URL))
-    assert {line.partition(": ")[2] for line in caplog.messages} == {"OSError: SlowDown; trying again in 0 s"}
+    assert {line.partition(": ")[2] for line in caplog.messages} == {"OSError: SlowDown; trying again in 0.1 s"}
 
 
 def test_shards_are_copied_ahead_in_the_order_of_reading(records, monkeypatch):
@@ -268,18 +261,29 @@ def test_records_are_not_written_to_a_url(tmp_path, monkeypatch):
     assert not list(tmp_path.glob("memory*"))
 
 
-def test_kinds_that_are_not_installed_are_named():
-    refused(
-        StoreError, r"nowhere://x cannot be opened .*pip install 'touchr1-jax\[cloud\]'", lambda: Mirror("nowhere://x")
-    )
-    assert isinstance(place("a/b:c"), pathlib.Path)
-    assert isinstance(place("/a"), pathlib.Path)
-
-
-@pytest.mark.parametrize("size", ["much", "nan", "inf", "-1"])
-def test_a_size_of_the_cache_that_is_none_is_named(monkeypatch, size):
+@pytest.mark.parametrize(
+    ("cache", "size", "url", "message"),
+    [
+        ("c", "1", "nowhere://x", r"nowhere://x cannot be opened .*pip install 'touchr1-jax\[cloud\]'"),
+        *(("c", "1", url, f"{url} cannot be opened") for url in ("reference://x", "dir://x")),
+        *(("c", n, URL, f"CACHE_GB is '{n}': must be a number of gigabytes") for n in ("much", "nan", "inf", "-1")),
+        ("~nobody-of-that-name/x", "1", URL, "TOUCHR1_CACHE is '~nobody-of-that-name/x'"),
+    ],
+)
+def test_what_cannot_be_a_store_or_its_cache_is_named(monkeypatch, cache, size, url, message):
+    monkeypatch.setenv(remote.CACHE, cache)
     monkeypatch.setenv(remote.CACHE_GB, size)
-    refused(StoreError, f"TOUCHR1_CACHE_GB is '{size}': must be a number of gigabytes", lambda: Mirror("memory://x"))
+    refused(StoreError, message, lambda: Mirror(url))
+
+
+@pytest.mark.parametrize("path", ["a/b:c", "/a"])
+def test_a_path_is_no_url(path):
+    assert place(path) == pathlib.Path(path)
+
+
+def test_records_at_a_url_cannot_be_pushed(capsys):
+    assert main(["push", "memory://a/b", "memory://c/d"]) == 1
+    assert "must be a folder on this machine" in capsys.readouterr().err
 
 
 def test_a_path_of_this_machine_begins_at_its_root(records, tmp_path, monkeypatch):
@@ -291,17 +295,3 @@ def test_a_path_of_this_machine_begins_at_its_root(records, tmp_path, monkeypatc
     assert (tmp_path / "pushed" / "index.json").is_file()
     assert not list((tmp_path / "elsewhere").iterdir())
     assert len(RecordStore(f"file:{tmp_path}/pushed")) == len(RecordStore(records))
-
-
-@pytest.mark.parametrize("url", ["reference://x", "dir://x"])
-def test_kinds_that_need_more_than_a_url_are_named(url, capsys):
-    assert main(["list", url]) == 1
-    assert f"StoreError: {url} cannot be opened" in capsys.readouterr().err
-
-
-def test_a_home_that_is_none_and_records_at_a_url_are_named(records, monkeypatch, capsys):
-    assert main(["push", "memory://a/b", "memory://c/d"]) == 1
-    assert "must be a folder on this machine" in capsys.readouterr().err
-    monkeypatch.setenv(remote.CACHE, "~nobody-of-that-name/x")
-    assert main(["list", "memory://a/b"]) == 1
-    assert "TOUCHR1_CACHE is '~nobody-of-that-name/x'" in capsys.readouterr().err

@@ -54,10 +54,15 @@ def test_a_folder_gives_back_the_policy(asking, tmp_path):
     np.testing.assert_allclose(again.probabilities, found.probabilities, rtol=1e-5)
 
 
+@pytest.fixture(scope="module")
+def drawn():
+    return explorer(0)
+
+
 @pytest.mark.parametrize("damage", ["byte", "missing", "version"])
-def test_a_damaged_folder_is_named(tmp_path, damage):
+def test_a_damaged_folder_is_named(drawn, tmp_path, damage):
     folder = tmp_path / "policy"
-    save_explorer(folder, explorer(0))
+    save_explorer(folder, drawn)
     if damage == "byte":
         content = bytearray((folder / "model.safetensors").read_bytes())
         content[-5] ^= 1
@@ -84,9 +89,8 @@ def test_a_damaged_folder_is_named(tmp_path, damage):
         (lambda one: {"encoder": dataclasses.replace(one.encoder, width=16)}, "of another shape"),
     ],
 )
-def test_parameters_that_answer_nothing_are_refused(tmp_path, change, message):
-    one = explorer(0)
-    save_explorer(tmp_path / "policy", dataclasses.replace(one, **change(one)))
+def test_parameters_that_answer_nothing_are_refused(drawn, tmp_path, change, message):
+    save_explorer(tmp_path / "policy", dataclasses.replace(drawn, **change(drawn)))
     with pytest.raises(PolicyError, match=message):
         read_explorer(tmp_path / "policy")
 

@@ -12,15 +12,13 @@ from sensors_io.__main__ import main
 from tests.experiments import tiny
 from tests.sensors_io.importers.films import film
 
-OBJECTS = 16
-
 
 @pytest.mark.slow
 def test_clips_become_a_policy_that_is_asked(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "clips").mkdir()
     lines = ["clip,hardness,roughness,protrusion,material"]
-    for n in range(OBJECTS):
+    for n in range(16):
         film(tmp_path / "clips" / f"press_{n}.avi", frames=6)
         lines.append(f"press_{n},{n % 3},{n // 3 % 3},{n // 5 % 3},wood")
     (tmp_path / "labels.csv").write_text("\n".join(lines))

@@ -1,8 +1,4 @@
-"""A tiny training that spreads over processes, for processes of their own: `python -m` this module.
-
-Numbers follow random targets, of which each process draws its rows.  With `--pause S` every batch takes S seconds, so
-that a process can be killed between steps.
-"""
+"""A tiny training that spreads over processes, each of which draws its rows of random targets."""
 
 import dataclasses
 import sys

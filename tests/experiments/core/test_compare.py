@@ -117,17 +117,16 @@ def test_the_gravest_differences_come_first_and_the_others_are_counted(home, cap
 
 @pytest.mark.long
 def test_what_cannot_be_compared_is_said(home, tmp_path, capsys):
-    assert main(["compare", "coin", "dice", "--runs-dir", str(home)], package=FAKES) == 1
-    assert "'dice' is no run" in capsys.readouterr().err
-    assert main(["compare", "coin", "coin", "--runs-dir", str(home)], package=FAKES) == 1
-    assert "is named twice" in capsys.readouterr().err
-    assert main(["compare", "coin", "--runs-dir", str(home)], package=FAKES) == 1
-    assert "must be at least two" in capsys.readouterr().err
     (tmp_path / "config.json").write_text("{")
-    assert main(["compare", "coin", str(tmp_path), "--runs-dir", str(home)], package=FAKES) == 1
-    assert "DamagedFileError" in capsys.readouterr().err
     unfinished = tmp_path / "coin" / "20260101-000000"
     unfinished.mkdir(parents=True)
     (unfinished / "config.json").write_bytes((home / "coin" / stamps(home)[0] / "config.json").read_bytes())
-    assert main(["compare", str(unfinished), "coin", "--runs-dir", str(home)], package=FAKES) == 1
-    assert "must be finished to be compared; continue it with: python -m experiments coin" in capsys.readouterr().err
+    for others, said in (
+        (["dice"], "'dice' is no run"),
+        (["coin"], "is named twice"),
+        ([], "must be at least two"),
+        ([str(tmp_path)], "DamagedFileError"),
+        ([str(unfinished)], "must be finished to be compared; continue it with: python -m experiments coin"),
+    ):
+        assert main(["compare", "coin", *others, "--runs-dir", str(home)], package=FAKES) == 1
+        assert said in capsys.readouterr().err

@@ -6,6 +6,7 @@ import signal
 import threading
 import time
 
+import grain
 import jax.numpy as jnp
 import pytest
 from rich.console import Console
@@ -15,26 +16,6 @@ from experiments.core.context import Context
 from experiments.core.loops import run_loop
 from experiments.core.stopping import Stopped, Stopping
 from touchr1_jax.training.loop import LoopConfig
-
-
-class Numbers:
-    """Batches 0, 1, 2, …"""
-
-    def __init__(self):
-        self.count = 0
-
-    def __iter__(self):
-        return self
-
-    def __next__(self):
-        self.count += 1
-        return self.count - 1
-
-    def get_state(self):
-        return {"count": self.count}
-
-    def set_state(self, state):
-        self.count = state["count"]
 
 
 def open_run(folder, stopping=None) -> Context:
@@ -52,7 +33,8 @@ def add_up(context, seed, steps=6, at_step=lambda seed, step: None) -> float:
         return {"total": total}, {"total": total}
 
     loop = LoopConfig(steps=steps, save_every=2)
-    return float(run_loop(step, {"total": jnp.float32(0)}, Numbers(), loop, context, f"sum/{seed}")["total"])
+    numbers = iter(grain.MapDataset.range(steps).to_iter_dataset(grain.ReadOptions(num_threads=0)))
+    return float(run_loop(step, {"total": jnp.float32(0)}, numbers, loop, context, f"sum/{seed}")["total"])
 
 
 def train(folder, at_once, seeds=3) -> tuple[list[float], bytes]:

@@ -145,11 +145,7 @@ def two(folder: Path, name: str, *, code: int = 0, struck: tuple[str, ...] = ())
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["ablation_ordinal", "main_table", "ablation_leave_one_out"])
 def test_an_experiment_in_two_processes_gives_the_figures_of_one(tmp_path, name):
-    """Parameters and batches split between two processes over loopback; every logged figure to 1e-5, every answer.
-
-    A SIGTERM to the second of them in its third batch, the first of which gave shapes alone, ends both after
-    that step, saved; they then go on.
-    """
+    """Every logged figure to 1e-5, every answer; a SIGTERM to the second process ends both after a saved step."""
     finish(start(tmp_path / "one", name))
     stopped = two(tmp_path / "two", name, code=143, struck=("--strike", "4"))
     assert all("Stopped by SIGTERM" in output for output in stopped)

@@ -106,12 +106,13 @@ def results() -> Results:
 
 
 def write(directory, results, about="Does it?\n\nPerhaps.", description=DESCRIPTION) -> str:
-    lines = [f'{{"stage": "sft/{s}", "step": {t}, "loss": {t + s}}}\n' for s in range(2) for t in range(50)]
-    write_text(directory / "metrics.jsonl", "".join(lines))
     return write_report(directory, results, about=about, description=description).read_text()
 
 
 def test_the_page_is_well_formed_whole_and_loads_nothing(tmp_path, results):
+    lines = [f'{{"stage": "sft/{s}", "step": {t}, "loss": {t + s}}}\n' for s in range(2) for t in range(50)]
+    for folder in (tmp_path, tmp_path / "again"):
+        write_text(folder / "metrics.jsonl", "".join(lines))
     page = write(tmp_path, results)
     reader = read(page)
     assert all(load.startswith("data:image/") for load in reader.loads)
@@ -176,14 +177,14 @@ def test_bold_needs_a_paired_interval_without_zero(results):
         assert not is_best("acc", "paid", dataclasses.replace(results, comparisons=doubtful))
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "bold"), [(-1, 9, False), (0, 9, False), (-9, 0, False), (1, 9, True), (-9, -1, True)]
-)
-def test_a_difference_is_bold_where_its_interval_excludes_zero(tmp_path, results, low, high, bold):
-    page = write(tmp_path, dataclasses.replace(results, comparisons=(compared("acc", "paid", "unpaid", low, high),)))
-    shown = bounds(low, high, "+" + METRICS["acc"].format)
-    assert f">{shown}<" in page
-    assert (f"<b>{shown}</b>" in page) == bold
+def test_a_difference_is_bold_where_its_interval_excludes_zero(tmp_path, results):
+    bold = {(-1, 9): False, (0, 9): False, (-9, 0): False, (1, 9): True, (-9, -1): True}
+    arms = {name: row(60.0) for name in "abcde"}
+    pairs = tuple(compared("acc", arm, "blind", *interval) for arm, interval in zip(arms, bold, strict=True))
+    page = write(tmp_path, dataclasses.replace(results, arms=arms, comparisons=pairs))
+    shown = {interval: bounds(*interval, "+" + METRICS["acc"].format) for interval in bold}
+    assert all(f">{text}<" in page for text in shown.values())
+    assert {interval: f"<b>{text}</b>" in page for interval, text in shown.items()} == bold
 
 
 def test_a_run_without_curves_rollouts_or_middle_rate_has_no_such_sections(tmp_path):

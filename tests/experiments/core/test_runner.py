@@ -146,9 +146,6 @@ class LearningConfig:
     grpo: Learning = Learning()
 
 
-LEARNING = Experiment(name="learning", config=LearningConfig(), run=coin.run)
-
-
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
@@ -159,7 +156,8 @@ LEARNING = Experiment(name="learning", config=LearningConfig(), run=coin.run)
     ],
 )
 def test_options_of_a_choice_stand_anywhere(arguments, expected):
-    command = parse(LEARNING, arguments.split(), "about")
+    learning = Experiment(name="learning", config=LearningConfig(), run=coin.run)
+    command = parse(learning, arguments.split(), "about")
     assert command.config.grpo.algorithm == expected
 
 

@@ -114,22 +114,22 @@ def test_a_damaged_run_hides_no_other(tmp_path, capsys):
         assert "20260103-000000/config.json is not that of a run" in out
 
 
-@pytest.mark.parametrize("content", ["{}", "[]", "7", '{"config": {}}', FOREIGN % "3", FOREIGN % "{}"])
-def test_a_foreign_configuration_is_named(tmp_path, content):
-    (make_run(tmp_path, "20260101-000000") / "config.json").write_text(content)
-    with pytest.raises(DamagedFileError, match=r"config.json is not that of a run"):
-        runs.newest(tmp_path / "coin", {}, finished=False)
-
-
 @pytest.mark.parametrize(
     ("file", "content"),
-    [("results.json", "{}"), ("results.json", "1"), ("results.json", '{"verdict": 2}'), ("timing.json", "[]")],
+    [
+        *(("config.json", text) for text in ("{}", "[]", "7", '{"config": {}}', FOREIGN % "3", FOREIGN % "{}")),
+        *(("results.json", text) for text in ("{}", "1", '{"verdict": 2}')),
+        ("timing.json", "[]"),
+    ],
 )
-def test_foreign_results_and_times_are_named(tmp_path, file, content):
-    (tmp_path / "config.json").write_text(FOREIGN % '{"commit": "a", "dirty": false}')
-    (tmp_path / file).write_text(content)
+def test_a_foreign_file_is_named(tmp_path, file, content):
+    directory = make_run(tmp_path, "20260101-000000")
+    (directory / file).write_text(content)
     with pytest.raises(DamagedFileError, match=rf"{file} is not that of a run"):
-        runs.read_run(tmp_path)
+        runs.read_run(directory)
+    if file == "config.json":
+        with pytest.raises(DamagedFileError, match=rf"{file} is not that of a run"):
+            runs.newest(tmp_path / "coin", {}, finished=False)
 
 
 def test_a_run_is_named_by_path_stamp_or_experiment(tmp_path):

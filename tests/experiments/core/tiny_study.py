@@ -1,7 +1,4 @@
-"""A study with one arm at the tests' smallest sizes, for processes of their own: `python -m` this module NAME.
-
-With `--strike N` in front of all else it gets a SIGTERM while it makes batch N of SFT.
-"""
+"""A study with one arm at the tests' smallest sizes; with `--strike N` first, SIGTERM comes during batch N of SFT."""
 
 import dataclasses
 import importlib

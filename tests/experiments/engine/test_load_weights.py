@@ -37,21 +37,14 @@ def test_experiment_runs_shrunken(tmp_path, monkeypatch):
     assert not list(tmp_path.glob("weights-*"))  # the checkpoint is gone
 
 
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory):
-    """Folder of a random checkpoint in several shards, its size, and the progress of writing it."""
-    folder, progress = tmp_path_factory.mktemp("checkpoint"), []
-    size = random_checkpoint(folder, TINY, 50_000, lambda *word: progress.append(word))
-    return folder, size, progress
-
-
 def silent(done: int, total: int) -> None:
     del done, total
 
 
 @pytest.mark.long
-def test_readers_read_the_same_small_numbers(checkpoint):
-    folder, size, progress = checkpoint
+def test_readers_read_the_same_small_numbers(tmp_path):
+    folder, progress = tmp_path, []
+    size = random_checkpoint(folder, TINY, 50_000, lambda *word: progress.append(word))
     assert progress == sorted(progress)
     assert progress[-1] == (size, size)
     assert len(list(folder.glob("*.safetensors"))) > 3

@@ -34,10 +34,7 @@ def test_products_are_counted_through_loops():
 
 @pytest.mark.long
 def test_the_work_of_the_job_grows_with_the_prefix_as_it_must():
-    """What the job multiplies grows with the prefix by what it needs for each prompt token, but for the last layer.
-
-    Of that the prompt needs keys and values alone, and the gradient of nothing else: with four layers a quarter less.
-    """
+    """Of the last of four layers the prompt needs keys and values alone: at most a quarter less than by its tokens."""
     size = dataclasses.replace(TINY, num_layers=4)
     work = lambda prefix: sum(n * p.flops for p, n in products(traced(size, prefix), size.length).items())
     grown, needed = work(80) - work(16), 1e9 * (size.gflop(80) - size.gflop(16))

@@ -11,8 +11,6 @@ from experiments.mechanics.chooser_trial import ChooserTrial, SequenceTrial
 from sensors_io.scenes.chooser_survey import FEATURES
 from sensors_io.scenes.sensors import XENSE
 
-# By hand -------------------------------------------------------------------------------------------------------------
-
 ERROR = np.array([[0.30, 0.09, 0.02], [0.14, 0.20, 0.01], [0.90, 0.80, 0.70]])
 COST = np.array([1.0, 2.0, 4.0])
 
@@ -43,7 +41,14 @@ def test_frames_count_only_where_they_were_promised():
 
 
 def test_batches_survive_a_round_trip():
-    made = measurements(ERROR)
+    lengths = {"radius_mm": 3.0, "slope_share": 0.0, "window_mm": 18.0, "thickness_mm": 4.0}
+    made = MenuMeasurements(
+        features=np.ones((3, len(FEATURES))),
+        **{name: np.full(3, value) for name, value in lengths.items()},
+        errors=ERROR,
+        ms=np.ones((1, 3)),
+        family=np.full(3, "balls"),
+    )
     again = measured.join(MenuMeasurements, [jsonable(made), jsonable(made)])
     np.testing.assert_array_equal(again.errors, np.concatenate([made.errors, made.errors]))
     np.testing.assert_array_equal(again.family, np.concatenate([made.family, made.family]))
@@ -58,15 +63,3 @@ def test_families_are_what_they_say():
     ball = batch.gap_mm[48][1]
     assert ball.min() >= 0
     assert np.diff(ball, 2, axis=0).std() < 0.05 * np.diff(ball, 2, axis=0).mean()  # one curvature everywhere
-
-
-def measurements(error: np.ndarray) -> MenuMeasurements:
-    count, settings = error.shape
-    lengths = {"radius_mm": 3.0, "slope_share": 0.0, "window_mm": 18.0, "thickness_mm": 4.0}
-    return MenuMeasurements(
-        features=np.ones((count, len(FEATURES))),
-        **{name: np.full(count, value) for name, value in lengths.items()},
-        errors=error,
-        ms=np.ones((1, settings)),
-        family=np.full(count, "balls"),
-    )

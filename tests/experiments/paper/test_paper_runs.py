@@ -62,7 +62,7 @@ def results(directory):
 
 
 @pytest.mark.long
-def test_results_hold_every_arm_and_baseline(results, directory):
+def test_results_and_policies_of_every_arm_and_baseline_are_kept(results, directory, home):
     assert (list(results["arms"]), list(results["baselines"])) == (ARMS, BASELINES)
     for name, row in {**results["arms"], **results["baselines"]}.items():
         seeds = 2 if name in (*ARMS, "tactile_blind") else 1
@@ -74,10 +74,6 @@ def test_results_hold_every_arm_and_baseline(results, directory):
     assert results["baselines"]["constant_middle"]["middle_rate"]["mean"] == 100
     assert results["config"]["grpo_steps"] == 2
     assert (directory / "plots" / "calibration.svg").exists()
-
-
-@pytest.mark.long
-def test_every_policy_of_every_seed_is_saved_and_found(directory, home):
     saved = {str(path.relative_to(directory / "policies")) for path in (directory / "policies").glob("*/*")}
     assert saved == {f"{name}/{seed}" for name in ARMS for seed in (0, 1)}
     found = find_policy("ablation_ordinal/latest/ordinal/1", home)

@@ -23,28 +23,22 @@ from touchr1_jax.bench.grounding import CONTROLS
 from touchr1_jax.models.load import load_checkpoint
 from touchr1_jax.models.released_policy import build_released_policy
 
+SERVER = ["--rollouts.url", "http://127.0.0.1:9", "--rollouts.tries", "1"]
+
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("weights", "message"),
+    ("options", "message"),
     [
-        (None, "weights is None: must be the folder of a released Qwen2.5-VL"),
-        ("nowhere", "nowhere/config.json is no file: must be the config.json of a checkpoint; correct the directory"),
+        ([], "weights is None: must be the folder of a released Qwen2.5-VL"),
+        (["--weights", "nowhere"], "nowhere/config.json is no file: must be the config.json of a checkpoint"),
+        (["--scale", "smoke", *SERVER, "--weights"], "http://127.0.0.1:9/v1/models gave no answer in 1 tries"),
     ],
 )
-def test_a_folder_without_weights_is_named_before_data_are_made(tmp_path, capsys, weights, message):
+def test_absent_weights_and_servers_are_named_before_data_are_made(tmp_path, weights, capsys, options, message):
     places = ["--runs-dir", str(tmp_path / "runs"), "--cache-dir", str(tmp_path / "data")]
-    assert main(["touch_r1", *places, *([] if weights is None else ["--weights", str(tmp_path / weights)])]) == 1
-    assert "".join(message.split()) in "".join(capsys.readouterr().err.split())
-    assert not list((tmp_path / "data").glob("scenes-*"))
-
-
-@pytest.mark.long
-def test_a_server_that_is_not_there_is_named_before_data_are_made(tmp_path, weights, capsys):
-    places = ["--runs-dir", str(tmp_path / "runs"), "--cache-dir", str(tmp_path / "data")]
-    server = ["--rollouts.url", "http://127.0.0.1:9", "--rollouts.tries", "1"]
-    assert main(["touch_r1", "--scale", "smoke", *places, "--weights", str(weights), *server]) == 1
-    message = "http://127.0.0.1:9/v1/models gave no answer in 1 tries, the last ended in URLError"
+    there = [str(weights)] if options[-1:] == ["--weights"] else []
+    assert main(["touch_r1", *options, *there, *places]) == 1
     assert "".join(message.split()) in "".join(capsys.readouterr().err.split())
     assert not list((tmp_path / "data").glob("scenes-*"))
 

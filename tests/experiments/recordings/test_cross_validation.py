@@ -82,20 +82,16 @@ def test_the_surest_answers_are_those_of_the_least_expected_distance():
     assert (same.mean, same.low, same.high) == (0, 0, 0)
 
 
-def videos_of(level: np.ndarray) -> DescribedVideos:
-    noise = np.random.default_rng(0).standard_normal((len(level), 3))
-    return DescribedVideos(
-        names=np.arange(len(level)).astype(str),
-        objects=OBJECTS,
-        label=level,
-        x=np.concatenate([level, level], 1) + 0.1 * np.tile(noise, 2),
-        rating=np.stack([4.0 * level[:, 0], 4.0 * level[:, 1], np.full(len(level), np.nan)], 1),
-    )
-
-
 def test_logistic_regression_and_people_find_what_determines_the_level(monkeypatch):
     monkeypatch.setattr("experiments.recordings.cross_validation.PENALTY", 1.0)
-    videos = videos_of(LABEL)
+    noise = np.random.default_rng(0).standard_normal((len(LABEL), 3))
+    videos = DescribedVideos(
+        names=np.arange(len(LABEL)).astype(str),
+        objects=OBJECTS,
+        label=LABEL,
+        x=np.concatenate([LABEL, LABEL], 1) + 0.1 * np.tile(noise, 2),
+        rating=np.stack([4.0 * LABEL[:, 0], 4.0 * LABEL[:, 1], np.full(len(LABEL), np.nan)], 1),
+    )
     found = logistic(videos, deal_folds(OBJECTS, LABEL, 4, 0))
     assert (choose(found)[:, :2] == LABEL[:, :2]).mean() > 0.7
     said = people(videos)

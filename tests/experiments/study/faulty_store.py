@@ -20,12 +20,7 @@ ANSWERS = {
 
 
 class FaultyStore:
-    """An application that answers a share of the requests with a fault, and hands on the others.
-
-    Args:
-      app: that answers.
-      faults: share of each of `ANSWERS`; `full` counts uploads alone; `stall_s`.
-    """
+    """Answers a share of the requests with each fault, `full` uploads alone, and hands on the others."""
 
     def __init__(self, app: Callable[..., Iterable[bytes]], faults: Mapping[str, float]):
         self._app, self._faults, self._rng, self._count = app, dict(faults), random.Random(0), 0

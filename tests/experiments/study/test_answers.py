@@ -58,17 +58,12 @@ def test_a_perfect_answer_earns_the_sum_of_the_weights_and_silence_the_penalty(p
     np.testing.assert_allclose(mute["exact"], np.where(material, -0.06 / 0.7, -0.06), atol=1e-6)
 
 
-@pytest.fixture
-def ask(policy, params):
-    """Evaluate some contacts in blocks of eight questions, two contacts each."""
-    return lambda features, label, **more: evaluate_policy(policy, params, features, label, batch_size=8, **more)
-
-
 LABEL = np.array([[0, 1, 2, 8], [2, 1, 0, 0], [1, 1, 1, 4]], np.int32)
 
 
 @pytest.mark.long
-def test_padding_the_last_block_changes_nothing(policy, ask):
+def test_padding_the_last_block_changes_nothing(policy, params):
+    ask = lambda features, label: evaluate_policy(policy, params, features, label, batch_size=8)  # of two contacts
     features = tiny.features(3)
     whole, padded = (ask(jax.tree.map(lambda x, n=n: x[:n], features), LABEL[:n]) for n in (2, 3))
     assert (len(whole.tokens), len(padded.tokens)) == (8, 12)

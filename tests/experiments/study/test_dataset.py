@@ -12,8 +12,6 @@ from sensors_io.records import RecordStore
 from sensors_io.schema import SENSORS
 from tests.sensors_io import fakes
 
-ONE_THIRD = 1 / 3
-
 
 def test_no_object_is_in_two_parts_and_no_contact_is_lost(data):
     objects = {part: set(data.object_ids[rows]) for part, rows in data.parts.items()}
@@ -63,7 +61,7 @@ def test_the_prior_is_that_of_training_labels_alone(data):
     hand = np.zeros((4, 9))
     hand[0, :2] = 2 / 3, 1 / 3
     hand[1, 1:3] = 1 / 2, 1 / 2
-    hand[2, :3] = ONE_THIRD  # annotated in validation alone: nobody knows
+    hand[2, :3] = 1 / 3  # annotated in validation alone: nobody knows
     hand[3, [0, 8]] = 1 / 3, 2 / 3
     assert prior.dtype == np.float32
     np.testing.assert_allclose(prior, hand, atol=1e-7)

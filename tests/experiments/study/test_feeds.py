@@ -62,10 +62,6 @@ def encoded(policy, data, evidence):
     return feed
 
 
-PACKED = {"packing": Packing(width=128, contacts=1)}
-"""Every contact by itself, so that whoever reads some contacts packs those alone."""
-
-
 @pytest.fixture(scope="module")
 def features(data):
     return tiny.features(len(data.parts["grpo"]))
@@ -79,7 +75,8 @@ def questions(policy, data, features):
 
 @pytest.fixture
 def feeds(answers, encoded, questions):
-    return {"answers": answers, "encoded": encoded, "questions": questions, "packed": partial(answers, **PACKED)}
+    packed = partial(answers, packing=Packing(width=128, contacts=1))  # whoever reads some contacts packs those alone
+    return {"answers": answers, "encoded": encoded, "questions": questions, "packed": packed}
 
 
 def attribute_of(policy, ids: np.ndarray) -> int:
@@ -317,27 +314,19 @@ def test_the_order_of_questions_is_not_made_ahead(questions):
     assert set(threading.enumerate()) <= before  # those of other feeds may end meanwhile
 
 
-def test_targets_describe_the_question(policy, questions, data):
-    label = data.label[data.parts["grpo"]]
-    for _, batch in zip(range(5), questions(), strict=False):
-        target = jax.tree.map(np.asarray, batch.target)
-        assert (target.asked.sum(1) == 1).all()
-        assert (target.label[target.asked] >= 0).all()
-        assert (target.levels == [3, 3, 3, 9]).all()
-        assert (target.ordinal == [True, True, True, False]).all()
-        for ids, mask, asked, row in zip(batch.ids, batch.mask, target.asked, target.label, strict=True):
-            a = attribute_of(policy, ids)
-            assert asked[a]
-            assert row[a] in label[:, a]
-            assert np.array_equal(mask, policy.layout.mask[a])
-
-
-def test_a_question_is_felt_by_the_streams_that_it_says(policy, features, data):
+def test_a_question_says_what_it_asks_and_is_felt_by_the_streams_that_it_says(policy, features, data):
     label, rows, attribute = data.label[data.parts["grpo"]], np.array([2, 0]), np.array([1, 3])
     streams = np.array([[True, False, False, True], [False, True, True, False]])
     batch = question_batch(policy, features, label, rows, attribute, streams)
-    assert np.array_equal(batch.features.stream_mask, streams & features.stream_mask[rows])
-    assert np.array_equal(batch.target.streams, streams)
+    assert [attribute_of(policy, ids) for ids in batch.ids] == [1, 3]
+    np.testing.assert_array_equal(batch.mask, policy.layout.mask[attribute])
+    np.testing.assert_array_equal(batch.features.stream_mask, streams & features.stream_mask[rows])
+    np.testing.assert_array_equal(batch.features.touch, features.touch[rows])
     assert not batch.ordered.any()  # a press shows its peak in whatever order
-    assert np.array_equal(batch.features.touch, features.touch[rows])
-    assert np.array_equal(take(features, rows).view, features.view[rows])
+    np.testing.assert_array_equal(take(features, rows).view, features.view[rows])
+    target = batch.target
+    np.testing.assert_array_equal(target.streams, streams)
+    np.testing.assert_array_equal(target.asked, np.arange(4) == attribute[:, None])
+    np.testing.assert_array_equal(target.label, label[rows])
+    assert (np.asarray(target.levels) == [3, 3, 3, 9]).all()
+    assert (np.asarray(target.ordinal) == [True, True, True, False]).all()

@@ -196,10 +196,7 @@ def test_a_file_that_is_no_encoder_is_named_before_data_are_made(content, tmp_pa
     path = tmp_path / "encoder.npz"
     if content is not None:
         path.write_bytes(content)
-    assert main(["ablation_ordinal", "--scale", "smoke", "--encoder", str(path), *places(tmp_path)]) == 1
+    places = ["--runs-dir", str(tmp_path / "runs"), "--cache-dir", str(tmp_path / "cache")]
+    assert main(["ablation_ordinal", "--scale", "smoke", "--encoder", str(path), *places]) == 1
     assert f"EncoderError: encoder is {path}: " in capsys.readouterr().err
     assert not list(tmp_path.glob("cache/scenes-*"))
-
-
-def places(home) -> list[str]:
-    return ["--runs-dir", str(home / "runs"), "--cache-dir", str(home / "cache")]

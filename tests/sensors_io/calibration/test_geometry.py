@@ -83,10 +83,26 @@ def test_a_geometry_is_saved_and_loaded(tmp_path):
     loaded = CameraGeometry.load(tmp_path / "g.json")
     point = np.array([[10.0, 20.0]])
     np.testing.assert_array_equal(loaded.to_mm(point), lens().to_mm(point))
-    text = (tmp_path / "g.json").read_text()
-    for changed in ("{}", text.replace("0.06", "0.07", 1), text.replace("0.06", "NaN", 1)):
-        (tmp_path / "g.json").write_text(changed)
-        refused(GeometryError, "is no geometry|was changed|hash", CameraGeometry.load, tmp_path / "g.json")
+    (tmp_path / "g.json").write_text((tmp_path / "g.json").read_text().replace("0.06", "0.07", 1))
+    refused(GeometryError, "is no geometry", CameraGeometry.load, tmp_path / "g.json")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        None,
+        {"radial": [float("nan"), 0]},
+        {"homography": [[1, 0], [0, 1]]},
+        {"homography": [[0] * 3] * 3},
+        {"size_px": ["a", 1]},
+        {"size_px": [0, 8]},
+    ],
+)
+def test_a_file_of_another_geometry_is_named(tmp_path, change):
+    path = tmp_path / "g.json"
+    lens().save(path)
+    path.write_text("{}" if change is None else json.dumps(read_json(path) | change))
+    refused(GeometryError, "is no geometry", CameraGeometry.load, path)
 
 
 def test_bad_boards_are_refused():
@@ -112,20 +128,3 @@ def test_no_flipped_bit_of_a_geometry_reads_as_another(tmp_path):
             assert CameraGeometry.load(path).hash == whole, bit
         except GeometryError:
             continue
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"radial": [float("nan"), 0]},
-        {"homography": [[1, 0], [0, 1]]},
-        {"homography": [[0] * 3] * 3},
-        {"size_px": ["a", 1]},
-        {"size_px": [0, 8]},
-    ],
-)
-def test_a_file_of_another_geometry_is_named(tmp_path, change):
-    path = tmp_path / "g.json"
-    lens().save(path)
-    path.write_text(json.dumps(read_json(path) | change))
-    refused(GeometryError, "is no geometry", CameraGeometry.load, path)

@@ -45,18 +45,6 @@ def rate_hz(sequence) -> float:
     return 1e9 / float(np.median(np.diff(sequence.host_time_ns)))
 
 
-def test_free_motion_is_recorded_from_a_replay(tmp_path, press, capsys):
-    out = tmp_path / "records"
-    args = ["record", "--out", out, "--object-id", "cup", "--free-s", "0.3", "replay", "--path", press]
-    assert run(*args) == 0
-    made = RecordStore(out).contact(0)["tac3d"]
-    assert rate_hz(made) == pytest.approx(100, rel=0.3)
-    assert made.depth_mm.shape[1:] == (20, 20)
-    assert "\n1 contacts written, 0 recovered, 0 incomplete" in capsys.readouterr().out  # on a line of its own
-    assert run(*args) == 0
-    assert "nothing was missing: cup, site 0 is complete; name another --site" in capsys.readouterr().out
-
-
 @pytest.mark.long
 def test_a_replay_that_ends_leaves_its_contact_in_the_records(tmp_path, press, capsys):
     """The protocol asks for 20 N, the recording ends at 3: kept as incomplete, with the force of the sensor itself."""
@@ -197,14 +185,15 @@ def test_a_pin_board_gives_a_geometry(tmp_path):
     assert not (tmp_path / "h.json").exists()
 
 
-def test_two_sensors_are_recorded_into_one_contact(tmp_path, press):
-    """Each at its own rate, one offset taken off, with a page beside the recording."""
+def test_two_sensors_are_recorded_into_one_contact(tmp_path, press, capsys):
+    """Each at its own rate, one offset taken off, with a page beside the recording; once more, nothing is missing."""
     out, sync = tmp_path / "records", tmp_path / "s.json"
     late = Offset(late_s=0.1, spread_s=0.001, events=5, by="taps")
     Offsets(reference="netft", sensors={"gelsight_mini": late}).save(sync)
     camera = ["replay", "--path", pictures(tmp_path / "film", range(40, 80)), "--rate-hz", 50]
     bench = [*camera, "+", "replay", "--path", press]
-    assert run("record", "--out", out, "--object-id", "cup", "--free-s", 0.4, "--sync", sync, "--port", 0, *bench) == 0
+    args = ["record", "--out", out, "--object-id", "cup", "--free-s", 0.4, "--sync", sync, "--port", 0, *bench]
+    assert run(*args) == 0
     made = RecordStore(out).contact(0)
     assert list(made) == ["gelsight_mini", "tac3d"]
     assert rate_hz(made["gelsight_mini"]) == pytest.approx(50, rel=0.3)
@@ -212,6 +201,10 @@ def test_two_sensors_are_recorded_into_one_contact(tmp_path, press):
     starts = [s.host_time_ns[0] for s in made.values()]
     assert -0.15e9 < starts[0] - starts[1] < -0.05e9
     assert made["gelsight_mini"].camera["recording"]["late_s"] == 0.1
+    assert made["tac3d"].depth_mm.shape[1:] == (20, 20)
+    assert "\n1 contacts written, 0 recovered, 0 incomplete" in capsys.readouterr().out  # on a line of its own
+    assert run(*args) == 0
+    assert "nothing was missing: cup, site 0 is complete; name another --site" in capsys.readouterr().out
 
 
 def test_the_object_is_looked_at_before_it_is_touched(tmp_path, press):

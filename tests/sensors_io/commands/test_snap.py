@@ -24,15 +24,11 @@ def presses() -> BallPresses:
     return press_ball(TOUCHES)
 
 
-def frames_of(presses: BallPresses) -> list[np.ndarray]:
-    """A camera's stream: the gel at rest, then each press for three frames and a lift."""
-    lifted = [presses.background]
-    return lifted * 4 + [frame for picture in presses.pictures for frame in [picture] * 3 + lifted]
-
-
 def test_each_press_is_taken_once_where_it_is(presses: BallPresses) -> None:
     guide = PressGuide(presses.radius_mm, presses.mm_per_px, QUICK)
-    said = [guide.look(frame) for frame in frames_of(presses)]
+    lifted = [presses.background]  # the gel at rest, then each press for three frames and a lift
+    frames = lifted * 4 + [frame for picture in presses.pictures for frame in [picture] * 3 + lifted]
+    said = [guide.look(frame) for frame in frames]
     np.testing.assert_array_equal(np.stack([s.taken for s in said if s.taken is not None]), presses.pictures)
     assert np.abs(np.stack(guide.touches)[:, :2] - TOUCHES[:, :2]).max() < 3
     assert guide.done

@@ -175,12 +175,6 @@ def test_a_killed_reader_takes_its_server_along(vendors, request):
     assert not server.exists()
 
 
-def split(frame):
-    prefix = bridge.bridge_server.PREFIX
-    _, header, _ = prefix.unpack_from(frame)
-    return frame[prefix.size : prefix.size + header], frame[prefix.size + header :]
-
-
 def test_frames_cross_though_the_sdk_prints(monkeypatch, request):
     monkeypatch.chdir(request.config.rootpath)
     with config("3").open() as device:
@@ -206,7 +200,9 @@ def test_an_endless_sdk_ends_with_its_reader(monkeypatch, request):
 
 def test_any_array_comes_back():
     arrays = {"a": np.arange(6, dtype=np.int16).reshape(2, 3), "b": np.array([True, False])}
-    described, found = bridge.unpack(*split(pack(7, 99, "S1", arrays)))
+    frame, prefix = pack(7, 99, "S1", arrays), bridge.bridge_server.PREFIX
+    body, length = frame[prefix.size :], prefix.unpack_from(frame)[1]
+    described, found = bridge.unpack(body[:length], body[length:])
     assert (described["number"], described["stamp_ns"], described["serial"]) == (7, 99, "S1")
     for name, a in arrays.items():
         np.testing.assert_array_equal(found[name], a)

@@ -85,11 +85,10 @@ def test_status_and_damage_are_told():
 
 def test_damaged_calibrations_are_refused():
     refused(DeviceDataError, "of 10 bytes: must have 24", parse_calibration, NEWTONS[:10])
-    refused(
-        DeviceDataError, "header or unit is unknown", parse_calibration, CALIBRATION.pack(HEADER, 9, 3, 1, 1, *[1] * 6)
-    )
-    refused(DeviceDataError, "header or unit is unknown", parse_calibration, CALIBRATION.pack(7, 2, 3, 1, 1, *[1] * 6))
-    refused(DeviceDataError, "no counts per unit", parse_calibration, CALIBRATION.pack(HEADER, 2, 3, 0, 1, *[1] * 6))
+    stated = lambda *start: CALIBRATION.pack(*start, 1, *[1] * 6)
+    for header, unit in ((HEADER, 9), (7, 2)):
+        refused(DeviceDataError, "header or unit is unknown", parse_calibration, stated(header, unit, 3, 1))
+    refused(DeviceDataError, "no counts per unit", parse_calibration, stated(HEADER, 2, 3, 0))
 
 
 def test_pounds_are_converted():

@@ -78,12 +78,8 @@ def test_nothing_to_replay_is_named(tmp_path):
 def test_faults_are_checked():
     refused(ValueError, "drop_share is 1.0", Faults, drop_share=1.0)
     refused(ValueError, "jitter_s is -1.0", Faults, jitter_s=-1.0)
-    refused(
-        ValueError,
-        "ascending and apart",
-        Faults,
-        disconnects=(Disconnect(at_s=5, for_s=2), Disconnect(at_s=6, for_s=1)),
-    )
+    overlapping = Disconnect(at_s=5, for_s=2), Disconnect(at_s=6, for_s=1)
+    refused(ValueError, "ascending and apart", Faults, disconnects=overlapping)
 
 
 def test_a_video_at_its_own_rate(tmp_path):

@@ -150,18 +150,18 @@ def test_a_change_must_be_both_steep_and_large(levels: float, least_mm2: float, 
     assert changed_contacts(*step(levels), PITCH, ContactConfig(least_mm2=least_mm2)).count == count
 
 
-def test_thresholds_in_the_wrong_order_are_refused() -> None:
-    refused(ValueError, "must be 0 < low ≤ high", ContactConfig, low_mm=0.2, high_mm=0.1)
+CRITERIA = ("least_mm2", "rim", "steepness", "smoothing_mm")
 
 
-@pytest.mark.parametrize("field", ["least_mm2", "rim", "steepness", "smoothing_mm"])
-@pytest.mark.parametrize("value", [0.0, float("nan")])
-def test_criteria_of_contact_are_positive(field: str, value: float) -> None:
-    refused(ValueError, f"{field} is {value}: must be > 0", lambda: ContactConfig(**{field: value}))
-
-
-@pytest.mark.parametrize("change", [{"sinks_mm": 0.0}, {"near_mm": -1.0}, {"bent": float("nan")}])
-def test_settings_of_the_zero_that_mean_nothing_are_refused(change):
-    (name,) = change
-    with pytest.raises(ValueError, match=f"{name} is .*: must be ≥ 0"):
-        ZeroConfig(**change)
+@pytest.mark.parametrize(
+    ("config", "changes", "said"),
+    [
+        (ContactConfig, {"low_mm": 0.2, "high_mm": 0.1}, "must be 0 < low ≤ high"),
+        *((ContactConfig, {name: x}, f"{name} is {x}: must be > 0") for name in CRITERIA for x in (0.0, float("nan"))),
+        (ZeroConfig, {"sinks_mm": 0.0}, "sinks_mm is .*: must be ≥ 0"),
+        (ZeroConfig, {"near_mm": -1.0}, "near_mm is .*: must be ≥ 0"),
+        (ZeroConfig, {"bent": float("nan")}, "bent is .*: must be ≥ 0"),
+    ],
+)
+def test_settings_that_mean_nothing_are_refused(config, changes, said) -> None:
+    refused(ValueError, said, config, **changes)

@@ -101,9 +101,7 @@ def test_a_marker_gel_with_calibration_gives_everything() -> None:
 
 
 def test_what_does_not_fit_together_is_refused() -> None:
-    refused(
-        CalibrationError, "must be equal; calibrate this camera", lambda: Extractor(bare(), 0.2, calibration(bare()))
-    )
+    refused(CalibrationError, "must be equal; calibrate", lambda: Extractor(bare(), 0.2, calibration(bare())))
     contact, flags = np.zeros((2, 4, 5), bool), np.zeros(2, np.uint32)
     wrong = np.zeros((2, 4, 6), np.float32)
     refused(SchemaError, "depth_mm", Fields, contact=contact, flags=flags, mm_per_px=0.1, depth_mm=wrong)
@@ -113,29 +111,26 @@ def test_what_does_not_fit_together_is_refused() -> None:
         Extractor(bare(), 0.1).read(bare()[:80])
 
 
-@pytest.mark.parametrize("stated", ["0" * 16, "f" * 16])
-def test_a_calibration_is_read_back_and_a_changed_one_is_refused(tmp_path: pathlib.Path, stated: str) -> None:
-    made = calibration(dotted())
-    made.save(tmp_path / "c.npz")
-    assert Calibration.load(tmp_path / "c.npz").hash == made.hash
-    arrays = dict(np.load(tmp_path / "c.npz"))
-    arrays["plain"] = np.array(str(arrays["plain"]).replace(made.hash, stated))
-    np.savez(tmp_path / "d.npz", **arrays)
-    refused(CalibrationError, f"its hash is {made.hash}, not {stated}", Calibration.load, tmp_path / "d.npz")
+def test_a_calibration_is_read_back_and_a_changed_one_is_refused(tmp_path: pathlib.Path) -> None:
+    made, path = calibration(dotted()), tmp_path / "c.npz"
+    made.save(path)
+    assert Calibration.load(path).hash == made.hash
+    arrays = dict(np.load(path))
+    signed = [{"plain": np.array(str(arrays["plain"]).replace(made.hash, by * 16))} for by in "0f"]
+    for change in (*signed, {"weights": 2 * arrays["weights"]}):
+        np.savez(path, **arrays | change)
+        refused(CalibrationError, "its hash is", Calibration.load, path)
+    path.write_text("no zip")
+    refused(CalibrationError, "is no calibration", Calibration.load, path)
 
 
 def test_a_gap_is_flagged_and_a_still_is_not() -> None:
     extractor = Extractor(dotted(), 0.1)
-    far = dotted(11.0)
+    far, frames = dotted(11.0), np.stack([dotted()] * 5)
     found = [extractor.read(dotted()), extractor.read(far, gap=True), extractor.read(far, apart=True)]
     assert [bool(f.flags[0] & Flag.TIME_GAP) for f in found] == [False, True, False]
-
-
-def test_times_tell_the_gaps_of_a_run() -> None:
-    extractor = Extractor(bare(), 0.1, calibration(bare()))
-    frames = np.stack([bare()] * 5)
-    fields = extractor.extract(frames, np.array([0, 40, 80, 240, 280], np.int64))
-    assert [bool(f & Flag.TIME_GAP) for f in fields.flags.tolist()] == [False, False, False, True, False]
+    timed = extractor.extract(frames, np.array([0, 40, 80, 240, 280], np.int64)).flags
+    assert [bool(f & Flag.TIME_GAP) for f in timed.tolist()] == [False, False, False, True, False]
     assert not (extractor.extract(frames).flags & np.uint32(Flag.TIME_GAP)).any()  # stills carry no time
     with pytest.raises(ValueError, match="host_time_ns has 2 times: must have 5"):
         extractor.extract(frames, np.array([0, 1], np.int64))

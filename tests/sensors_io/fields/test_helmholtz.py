@@ -25,9 +25,3 @@ def test_spread_is_a_gradient_and_twist_is_shear(field, part):
 @pytest.mark.parametrize("field", [np.ones_like(SPREAD), np.stack([X, -Y], -1)], ids=["translation", "pure shear"])
 def test_what_flows_through_the_border_is_harmonic(field):
     np.testing.assert_allclose(decompose(field, PITCH).harmonic, field, atol=1e-9)
-
-
-def test_the_parts_add_up():
-    field = SPREAD + 0.3 * TWIST + 0.2
-    parts = decompose(field, PITCH)
-    np.testing.assert_allclose(parts.gradient + parts.rotation + parts.harmonic, field, atol=1e-12)

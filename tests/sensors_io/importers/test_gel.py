@@ -14,6 +14,7 @@ from sensors_io.importers.keep import ImportSourceError
 from sensors_io.importers.pictures import read_picture
 from sensors_io.importers.videos import VideosConfig, list_videos
 from sensors_io.records import RecordsExistError, RecordStore
+from tests.sensors_io import fakes
 from tests.sensors_io.checks import refused
 
 GELSLAM = pathlib.Path(__file__).resolve().parents[2] / "data" / "gelslam"
@@ -61,6 +62,8 @@ def test_check_and_extract_read_what_an_import_kept_or_is_given(tmp_path, presse
     run(*videos, "--out", kept, "--mm-per-px", 0.0634, "--background", rest)
     assert "not looked at: 1 sequences, no gel at rest" in run("check", plain, "--pictures", "--mm-per-px", 0.1268)
     assert "nothing tells their mm per px" in run("check", plain, "--pictures", "--rest-frames", 1)
+    skin = fakes.write(tmp_path / "skin", 1, sensors=("tac3d",))
+    assert "not looked at: 1 sequences, they hold no pictures" in run("check", skin, "--pictures")
     looked = [
         run("check", kept, "--pictures"),
         run("check", plain, "--pictures", "--background", rest, "--mm-per-px", 0.1268),

@@ -53,11 +53,10 @@ def write_map(folder, layout):
     return path
 
 
-def imported(folder, layout, **config):
+def imported(folder, layout, out="records"):
     """Sequences and report of an import."""
-    catalogue = list_hdf5(folder, HDF5Config(map=write_map(folder, layout), **WHOLE | config))
-    report = import_catalogue(catalogue, folder / "records")
-    store = RecordStore(folder / "records")
+    report = import_catalogue(list_hdf5(folder, HDF5Config(map=write_map(folder, layout), **WHOLE)), folder / out)
+    store = RecordStore(folder / out)
     return [tuple(store.contact(i).values()) for i in range(len(store))], report
 
 
@@ -153,12 +152,7 @@ def test_ragged_rows_of_compressed_arrays(tmp_path):
     layout["sensors"]["digit"]["frames"]["rows"] = {"offsets": "/offsets"}
     with h5py.File(tmp_path / "a.hdf5", "a") as file:
         file["offsets"] = [0, 2, 5, 7]
-    assert "7 are stated" in " ".join(skip.reason for skip in imported_anew(tmp_path, layout).skipped)
-
-
-def imported_anew(folder, layout):
-    catalogue = list_hdf5(folder, HDF5Config(map=write_map(folder, layout), **WHOLE))
-    return import_catalogue(catalogue, folder / "again")
+    assert "7 are stated" in " ".join(skip.reason for skip in imported(tmp_path, layout, "again")[1].skipped)
 
 
 def test_a_file_for_each_contact_and_pictures_as_png(tmp_path):

@@ -10,11 +10,7 @@ MS = 1_000_000
 
 
 class Hand:
-    """Time passes by 10 ms at every look of the camera; the force follows the phase that was shown last.
-
-    Args:
-      slips_at: numbers of contacts in which the hand lets go while it should hold.
-    """
+    """10 ms pass at every look of the camera; the force follows the phase shown last, and slips in some contacts."""
 
     def __init__(self, slips_at=()):
         self.time_ns, self.force_n, self.shown, self.contacts = 10**9, 0.0, None, 0
@@ -80,11 +76,7 @@ class Scale:
 
 
 class Skin:
-    """A feed of fields and forces, at the times of the camera's looks, stamped late.
-
-    Args:
-      hand: whose force it tells, as it was when the moment came that its stamp says, less `late_ns`.
-    """
+    """A feed of fields and of the hand's force, at the times of the camera's looks, stamped `late_ns` later."""
 
     identity = property(lambda self: Identity(sensor="tac3d", serial="A1", period_s=0.01))
     counts = property(lambda self: Counts(arrived=self.count, delivered=self.count))

@@ -13,10 +13,8 @@ import pytest
 
 from sensors_io.devices.errors import DeviceLostError
 from sensors_io.force import ForceError, GravityModel
-from sensors_io.recording.assemble import assemble
 from sensors_io.recording.book import ATTEMPTS, ObjectView
 from sensors_io.recording.coach import CoachConfig, ContactStage, protocol
-from sensors_io.recording.journal import JournalError, JournalWriter
 from sensors_io.recording.session import SessionConfig, record_session
 from sensors_io.records import RecordsExistError, RecordStore
 from sensors_io.schema import Flag, SchemaError
@@ -241,9 +239,3 @@ def test_sensors_of_one_name_and_records_of_other_sensors_are_refused(tmp_path):
         record_session(tmp_path, SHORT, [Camera(hand), Camera(hand)], Scale(hand), show=hand.show)
     session(tmp_path, hand, SHORT)
     refused(RecordsExistError, r"recorded-2 gelsight_mini', not 'recorded-2 gelsight_mini\+tac3d'", both, tmp_path)
-
-
-def test_a_journal_of_an_earlier_version_is_refused(tmp_path):
-    with JournalWriter(tmp_path / "old.journal") as writer:
-        writer.append("start", {"key": {}, "identity": {}})
-    refused(JournalError, "earlier version", assemble, tmp_path / "old.journal")

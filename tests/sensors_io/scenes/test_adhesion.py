@@ -16,10 +16,7 @@ STIFF = Adhesion(radius_mm=1e-4, plane_modulus_mpa=1e5, work_n_per_mm=5e-5)
 
 
 def same_width_n(sphere: Adhesion, force_n: float) -> float:
-    """Force F₁ at which the contact without adhesion is as wide: a³ = 3RF₁ / 4E*.
-
-    JKR  F₁ = F + 3πwR + √(6πwRF + (3πwR)²) from a Tabor parameter of 1 on, DMT  F₁ = F + 2πwR below.
-    """
+    """F₁ of an equally wide contact without adhesion: JKR F + 3πwR + √(6πwRF + (3πwR)²), DMT F + 2πwR."""
     unit = np.pi * sphere.work_n_per_mm * sphere.radius_mm
     if sphere.tabor < 1:
         return force_n + 2 * unit

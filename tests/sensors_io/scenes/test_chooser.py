@@ -60,14 +60,6 @@ def _survey(gap, force_n: float = 2.0):
     return surveyed(found.pressure_mpa, found.displacement_mm, gaps, one, WINDOW_MM, GEL.thickness_mm)
 
 
-def test_the_menu_is_sorted_begins_with_the_look_and_can_be_solved() -> None:
-    costs = [s.cost for s in MENU]
-    assert costs == sorted(costs)
-    assert MENU[0] == LOOK
-    assert len(set(MENU)) == len(MENU)
-    assert all(s.grid % 2 == 0 == s.padded % 2 and s.padded >= s.grid for s in MENU)
-
-
 def test_law_and_menu_are_those_that_were_fitted() -> None:
     """By `pareto_chooser`; fitted anew, they have other checksums."""
     law = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(LAW)])

@@ -7,8 +7,6 @@ import pytest
 
 from sensors_io.scenes.friction import dot, onto_discs, shift_to_total
 
-SHIFT = jax.jit(shift_to_total)
-
 
 def test_projection_and_scalar_product_by_hand() -> None:
     tangential, limit = np.array([[3 + 4j, 0.3 + 0.4j], [0, -2.0]]), np.array([[1.0, 1.0], [1.0, 0.0]])
@@ -24,7 +22,9 @@ def test_the_shifted_projection_carries_the_force(share: float, scale: float) ->
     limit = rng.random((24, 24)) * (rng.random((24, 24)) < 0.5)
     traction = scale * (rng.standard_normal((24, 24)) + 1j * rng.standard_normal((24, 24)) + 0.7)
     total = share * limit.sum() * np.exp(2j)
-    shift = SHIFT(jnp.asarray(traction, jnp.complex64), limit.astype(np.float32), total, jnp.complex64(0))
+    shift = jax.jit(shift_to_total)(
+        jnp.asarray(traction, jnp.complex64), limit.astype(np.float32), total, jnp.complex64(0)
+    )
     nearest = np.asarray(onto_discs(traction + complex(shift), limit))
     assert abs(nearest.sum() - total) < 1e-4 * limit.sum()
     other = limit * share * np.exp(2j)  # admissible, carries the force too

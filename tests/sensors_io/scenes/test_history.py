@@ -17,12 +17,6 @@ paths = st.lists(st.floats(0, 10), min_size=1, max_size=12)
 losses = st.floats(0, 0.9)
 
 
-def _path(corners: list[float], between: int = 200) -> np.ndarray:
-    """From 0 by straight lines over all corners back to 0."""
-    at = [0.0, *corners, 0.0]
-    return np.interp(np.linspace(0, len(at) - 1, between * (len(at) - 1) + 1), np.arange(len(at)), at)
-
-
 def _depth(elastic_force: np.ndarray, exponent: float = 1.5) -> np.ndarray:
     """Any virgin curve will do: F = δ^exponent."""
     return elastic_force ** (1 / exponent)
@@ -47,7 +41,8 @@ def test_a_full_loop_loses_its_share_for_any_virgin_curve(exponent: float, loss:
 @settings(max_examples=60, deadline=None)
 @given(corners=paths, loss=losses)
 def test_no_path_gains_energy(corners: list[float], loss: float) -> None:
-    force = _path(corners)
+    at = [0.0, *corners, 0.0]  # by straight lines
+    force = np.interp(np.linspace(0, len(at) - 1, 200 * (len(at) - 1) + 1), np.arange(len(at)), at)
     elastic = history.elastic_force(force, loss)
     if force.max() > 1e-3:  # below it rounding is all the work there is
         assert history.returned_share(force, _depth(elastic)) <= 1 - loss + 1e-2

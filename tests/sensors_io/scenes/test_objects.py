@@ -23,8 +23,6 @@ KINDS = ((1, "part"), (2, "graded"))
 SUMS = (698.749806, 758.587112, 921.512811)
 """Sums of all numbers of that object, of the second if it has a part, and of the third if it is graded."""
 
-NEAR_GAP = 0.999  # values come this close to the edge of the gap around a threshold
-
 
 def _numbers(made) -> Iterator[np.ndarray]:
     for value in vars(made).values():
@@ -38,6 +36,12 @@ def _sample(count: int, lie_share: float = 0.3) -> list[objects.Solid]:
     return [objects.sample(np.random.default_rng(i), lie_share, 0.8) for i in range(count)]
 
 
+@pytest.fixture(scope="module")
+def solids() -> list[objects.Solid]:
+    """Enough for statistics."""
+    return _sample(3000)
+
+
 @pytest.mark.parametrize("name", ALL)
 @given(latent=st.floats(-6, 6))
 def test_level_follows_the_thresholds(name: str, latent: float) -> None:
@@ -46,7 +50,7 @@ def test_level_follows_the_thresholds(name: str, latent: float) -> None:
     assert prop.extremes[0] <= value <= prop.extremes[1]
     assert prop.level(value) == sum(value >= t for t in prop.thresholds)
     for threshold in prop.thresholds:
-        assert abs(np.log(value / threshold)) >= NEAR_GAP * np.log(prop.gap) / 2
+        assert abs(np.log(value / threshold)) >= 0.999 * np.log(prop.gap) / 2  # no value lies in the gap
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -69,28 +73,26 @@ def test_material_informs_but_does_not_decide(name: str) -> None:
     assert odds.min() > 0.005  # the ranges of all materials overlap
 
 
-def test_frequencies_follow_the_odds() -> None:
-    solids = _sample(3000)
+def test_frequencies_follow_the_odds(solids: list[objects.Solid]) -> None:
     for name, prop in ALL.items():
         levels = np.array([s.levels()[name] for s in solids])
         np.testing.assert_allclose(np.bincount(levels) / 3000, properties.level_odds(prop).mean(0), atol=0.035)
 
 
-def test_truth_explains_the_labels() -> None:
+def test_truth_explains_the_labels(solids: list[objects.Solid]) -> None:
     explained = {
         "hardness": ("modulus_mpa", properties.HARDNESS_MPA),
         "roughness": ("rms_mm", properties.ROUGHNESS_MM),
         "protrusion": ("feature_height_mm", properties.PROTRUSION_MM),
     }
-    for solid in _sample(50):
+    for solid in solids[:50]:
         levels = {name: sum(solid.truth()[of] >= t for t in limits) for name, (of, limits) in explained.items()}
         assert solid.labels() == levels | {"material": solid.material}
 
 
-def test_lies_are_told_at_their_rate_and_contradict() -> None:
-    solids = _sample(2000)
+def test_lies_are_told_at_their_rate_and_contradict(solids: list[objects.Solid]) -> None:
     lies = [s for s in solids if s.looks_like != s.material]
-    assert len(lies) / 2000 == pytest.approx(0.3, abs=0.04)
+    assert len(lies) / 3000 == pytest.approx(0.3, abs=0.04)
     for solid in lies:
         own, shown = objects.typical_levels(solid.material), objects.typical_levels(solid.looks_like)
         assert sum(a != b for a, b in zip(own, shown, strict=True)) >= 2

@@ -82,10 +82,8 @@ def test_a_prescribed_slide_finds_its_force() -> None:
     assert stuck(forces, slides, jnp.float32(FORCE), FRICTION, jnp.float32(1.05 * full)) == 0
 
 
-GEL = Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=4.0)
-
-
 @pytest.mark.parametrize(("body", "error"), [(None, 0.02331), (BODY, 0.01993)])
 def test_the_promised_error_by_hand(body: Layer | None, error: float) -> None:
     """Of its formula, worked out once; `pareto_tangential` measures whether the promise is kept."""
-    assert partial_slip.promised_error(GEL, body, 2.0) == pytest.approx(error, rel=1e-3)
+    gel = Layer(modulus_mpa=0.3, poisson=0.48, thickness_mm=4.0)
+    assert partial_slip.promised_error(gel, body, 2.0) == pytest.approx(error, rel=1e-3)

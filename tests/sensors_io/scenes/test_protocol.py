@@ -62,17 +62,11 @@ def test_generation_ends_and_refuses_a_start_outside() -> None:
 def test_each_contact_holds_the_four_sensors_in_order() -> None:
     for contact in one_per_object(5):
         assert tuple(s.sensor for s in contact) == SENSORS
-        assert len({s.key for s in contact}) == 1
+        assert [s.sensor for s in contact if s.frames is None] == ["tac3d"]
+        assert [s.sensor for s in contact if s.mm_per_px is None] == ["tac3d"]
+        assert [s.sensor for s in contact if s.shear_mm is None] == ["gelsight_mini"]
         for sequence in contact:
-            assert len(sequence) == SMALL.frame_count
-            assert np.all(np.diff(sequence.host_time_ns) > 0)
-            camera = sequence.sensor != "tac3d"
-            assert (sequence.frames is not None) == camera
-            assert (sequence.mm_per_px is not None) == camera
-            assert (sequence.shear_mm is None) == (sequence.sensor == "gelsight_mini")
-            assert sequence.depth_mm is not None
             assert sequence.depth_mm.shape == (SMALL.frame_count, 20, 20)
-            assert sequence.contact_region_px is not None
             x, y, width, height = sequence.contact_region_px
             assert 0 <= x < x + width <= SMALL.view_px
             assert 0 <= y < y + height <= SMALL.view_px
@@ -122,11 +116,8 @@ def test_labels_of_the_cards_match_the_truth() -> None:
     assert [c.object_id for c in cards] == [f"g{i:06d}" for i in range(SMALL.objects)]
     for card in cards:
         assert card.labels["hardness"] == (card.truth["modulus_mpa"] >= 0.5) + (card.truth["modulus_mpa"] >= 5.0)
-        assert card.view is not None
-        assert card.view.shape == (32, 32, 3)
-        assert card.annotator == "generator"
-    lies = np.mean([c.visual_lies for c in cards])
-    assert lies == pytest.approx(SMALL.visual_lie_share, abs=0.12)
+        assert (card.view.shape, card.annotator) == ((32, 32, 3), "generator")
+    assert np.mean([c.visual_lies for c in cards]) == pytest.approx(SMALL.visual_lie_share, abs=0.12)
 
 
 def test_splits_are_exact_and_follow_the_seed() -> None:

@@ -57,10 +57,6 @@ def _pull(limit: np.ndarray, force: tuple[float, float], compliance: traction.Co
     )
 
 
-def _force(solved: tangential.Traction) -> complex:
-    return complex(solved.traction_mpa.sum(dtype=np.complex128)) * SPACING**2
-
-
 def _rough_pressure(seed: int = 0) -> np.ndarray:
     """A ragged contact, as of dots on a ball."""
     rng = np.random.default_rng(seed)
@@ -76,7 +72,8 @@ def test_cattaneo_and_mindlin(share: float) -> None:
     assert complex(solved.slide_mm) == pytest.approx(SPHERE.slide_mm(share), rel=0.01)
     assert solved.stick_share == pytest.approx((SPHERE.stick_radius_mm(share) / A_MM) ** 2, abs=0.06)
     assert off(solved.traction_mpa, SPHERE.pulled_mpa(share, RADIUS)) < 0.06
-    assert _force(solved) == pytest.approx(share * most, rel=1e-5)
+    pulled = complex(solved.traction_mpa.sum(dtype=np.complex128)) * SPACING**2
+    assert pulled == pytest.approx(share * most, rel=1e-5)
 
 
 @pytest.mark.parametrize("stick_ratio", [0.8, 0.5, 0.2, 0.0])

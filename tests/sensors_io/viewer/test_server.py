@@ -52,7 +52,10 @@ def test_page_numbers_and_pictures():
             events.readline()
             again = json.loads(events.readline().removeprefix(b"data: "))
             assert (again["version"], again["alarm"]) == (said["version"] + 1, "overload")
-        assert picture(view, "tac3d: depth").mean((0, 1))[0] > 180
+            assert picture(view, "tac3d: depth").mean((0, 1))[0] > 180
+            view.publish({}, dataclasses.replace(NUMBERS, force_n=(0.0, float("nan"), float("inf"))))
+            events.readline()
+            assert json.loads(events.readline().removeprefix(b"data: "))["force_n"] == [0.0, None, None]
         for path in ("panel/shear", "etc/passwd"):
             refused(urllib.error.HTTPError, "404", ask, view, path)
 
@@ -147,13 +150,6 @@ def test_requests_of_no_browser_are_refused_without_a_word_in_the_terminal(capfd
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         assert requested(view)[0] == 200
     assert capfd.readouterr().err == ""
-
-
-def test_numbers_that_json_does_not_know_are_null():
-    with LiveView(port=0) as view:
-        view.publish({}, dataclasses.replace(NUMBERS, force_n=(0.0, float("nan"), float("inf"))))
-        with ask(view, "numbers") as events:
-            assert json.loads(events.readline().removeprefix(b"data: "))["force_n"] == [0.0, None, None]
 
 
 def test_streams_end_with_the_view_and_a_taken_port_is_an_error():
