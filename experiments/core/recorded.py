@@ -65,7 +65,8 @@ def show_recorded(name: str, module: str, runs_dir: Path) -> tuple[str, ...]:
     source = ROOT / Path(*module.split(".")).with_suffix(".py")
     about = ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))) or name
     results = from_json(past.results or {})
-    report = write_report(past.directory, results, about=about, description=past.description)
+    note = f"Recorded are figures alone; curves, pictures and examples come with a run: make experiment EXP={name}."
+    report = write_report(past.directory, results, about=about, description=past.description, note=note)
     return (f"report: {report}", *results.verdict)
 
 

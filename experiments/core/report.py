@@ -67,10 +67,13 @@ def settings_in_words(settings: Mapping[str, Any]) -> dict[str, str]:
     return {named[name][0]: named[name][1].format(value) for name, value in shown.items()}
 
 
-def write_report(directory: Path, results: Results, *, about: str, description: Mapping[str, Any]) -> Path:
+def write_report(
+    directory: Path, results: Results, *, about: str, description: Mapping[str, Any], note: str = ""
+) -> Path:
     """Write `report.html` and the pictures in `plots/` of a run and return the path of the report.
 
-    `about` is the docstring of the experiment, `description` the content of the run's `config.json`.
+    `about` is the docstring of the experiment, `description` the content of the run's `config.json`, `note` a remark on
+    the page.
     """
     rows = read_metrics(directory)
     mark, settings = marks(_charted(results.arms, rows)), settings_in_words(results.settings)
@@ -90,6 +93,7 @@ def write_report(directory: Path, results: Results, *, about: str, description: 
         render,
         "report.jinja",
         about=about,
+        note=note,
         description=description,
         timing=results.timing,
         settings=settings,
