@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax import masked
 from touchr1_jax.models.policy import Features
@@ -35,7 +35,7 @@ def rollout_metrics(
 def answer_metrics(parsed: Parsed, target: Target) -> dict[str, Array]:
     """Distribution of the answers: accuracy of each level, the most frequent answer, slots that repeat each other.
 
-    `right_level_k` is the share right of ordinal questions whose label is k, `labels_level_k` their number;
+    `right_level_k` is the share right of ordinal questions whose label is k = 0, 1 or 2, `labels_level_k` their number;
     `mode_share` the share of the most frequent level among ordinal answers, `label_mode_share` among their labels;
     `echo_share` the share of formatted answers whose slots all name one level; `gamed_share` the share of answers that
     name levels and are not formatted or name several in their conclusion.
@@ -45,8 +45,6 @@ def answer_metrics(parsed: Parsed, target: Target) -> dict[str, Array]:
     right = parsed.conclude == label
     levels = range(3)
     by_level = {k: asked & (label == k) for k in levels}
-    said = jnp.stack([masked.mean(parsed.conclude == k, asked & (parsed.conclude >= 0)) for k in levels])
-    truth = jnp.stack([masked.mean(label == k, asked & (label >= 0)) for k in levels])
     same = jnp.all((parsed.perceive == parsed.compare[..., None, :]) | ~target.streams[:, None, :, None], -2)
     same &= (parsed.compare == parsed.conclude) & (parsed.conclude >= 0)
     named = jnp.any(parsed.perceive >= 0, (-1, -2)) | jnp.any(parsed.compare >= 0, -1)
@@ -54,11 +52,18 @@ def answer_metrics(parsed: Parsed, target: Target) -> dict[str, Array]:
     return {
         **{f"right_level_{k}": masked.mean(right, by_level[k]) for k in levels},
         **{f"labels_level_{k}": jnp.sum(by_level[k]).astype(jnp.float32) for k in levels},
-        "mode_share": jnp.max(said),
-        "label_mode_share": jnp.max(truth),
+        "mode_share": _mode_share(parsed.conclude, asked),
+        "label_mode_share": _mode_share(jnp.broadcast_to(label, asked.shape), asked),
         "echo_share": masked.mean(same, asked & parsed.formatted[..., None]),
         "gamed_share": jnp.mean(named & unread),
     }
+
+
+def _mode_share(level: Int[Array, "P G A"], counted: Bool[Array, "P G A"]) -> Array:
+    """Share of the most frequent of the levels ≥ 0 that count; 0 without any."""
+    ordered = jnp.sort(jnp.where(counted, level, -1), axis=None)
+    alike = jnp.searchsorted(ordered, ordered, side="right") - jnp.searchsorted(ordered, ordered)
+    return jnp.max(jnp.where(ordered >= 0, alike, 0)) / jnp.maximum(jnp.sum(ordered >= 0), 1)
 
 
 def reward_metrics(

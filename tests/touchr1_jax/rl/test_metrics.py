@@ -78,7 +78,10 @@ def test_answer_metrics_by_hand():
         "echo_share": 0.4,  # the first rollouts of both questions for hardness, of five formatted ordinal answers
         "gamed_share": 0.25,  # roughness without format, material without a conclusion
     }
-    assert_metrics(answer_metrics(parsed, tiny.target(attribute, np.array([2, 0, 2, 1]))), expected)
+    found = answer_metrics(parsed, tiny.target(attribute, np.array([2, 0, 2, 1])))
+    assert_metrics(found, expected)
+    five = dataclasses.replace(parsed, conclude=jnp.where(parsed.conclude == 2, 4, parsed.conclude))
+    assert answer_metrics(five, tiny.target(attribute, np.array([4, 0, 4, 1])))["mode_share"] == found["mode_share"]
 
 
 def test_metrics_of_rewards_and_advantages_by_hand():
