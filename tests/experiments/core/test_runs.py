@@ -161,3 +161,7 @@ def test_an_experiment_without_runs_and_an_unknown_one_are_named(tmp_path, capsy
     assert f"has not run under {tmp_path}" in capsys.readouterr().out
     assert main(["list", "coyn", "--runs-dir", str(tmp_path)], package=FAKES) == 2
     assert "Did you mean coin?" in capsys.readouterr().err
+    (tmp_path / "file").touch()
+    for wrong in (str(tmp_path / "file"), str(tmp_path / "nowhere"), "s3://bucket/runs"):
+        assert main(["list", "--runs-dir", wrong], package=FAKES) == 2
+        assert "must be a folder of this machine" in capsys.readouterr().err
