@@ -123,7 +123,12 @@ def test_a_foreign_configuration_is_named(tmp_path, content):
 
 @pytest.mark.parametrize(
     ("file", "content"),
-    [("results.json", "{}"), ("results.json", "1"), ("results.json", '{"verdict": 2}'), ("timing.json", "[]")],
+    [
+        *(("results.json", content) for content in ("{}", "1", '{"verdict": 2}', '{"verdict": [2]}')),
+        ("results.json", '{"verdict": [], "requirements": [1]}'),
+        ("timing.json", "[]"),
+        ("timing.json", '{"total": NaN}'),
+    ],
 )
 def test_foreign_results_and_times_are_named(tmp_path, file, content):
     (tmp_path / "config.json").write_text(FOREIGN % '{"commit": "a", "dirty": false}')
