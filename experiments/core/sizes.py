@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Collection, Iterator
 from typing import Any
 
-
 INT32_MAX = 2**31 - 1  # of the whole numbers that arrays, seeds and sizes are made of
 
 LARGER = 1000

@@ -97,6 +97,23 @@ def test_wrong_arguments_are_named(capsys, arguments, message):
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["explain", "--text", ANSWER, "--length", "-1"], "length is -1: must lie in 0 … "),
+        (["explain", "--text", ANSWER, "--length", "2147483648"], "length is 2147483648: must lie in 0 … "),
+        (["explain", "--text", ANSWER, "--longest", "0"], "longest is 0: must lie in 1 … "),
+        (["explain", "--text", ANSWER, "--weights", "accuracy", "1e300"], "weights[accuracy] is 1e+300: must be"),
+        (["adversary", "--prior", "1", "1", "1"], "must be ≥ 0 and sum to 1"),
+        (["adversary", "--accuracy", "nan"], "accuracy is nan: must lie in 0 … 1"),
+        (["adversary", "--most", "-1"], "most is -1: must be at least 0"),
+    ],
+)
+def test_a_number_out_of_range_is_refused(capsys, arguments, message):
+    assert main(arguments) == 1
+    assert message in capsys.readouterr().err
+
+
 def test_what_cannot_be_trained_is_not_explained():
     branching = {"mine": Reward(lambda parsed, target: jnp.float32(1 if parsed.length > 3 else 0))}
     with pytest.raises(RewardError, match="reward 'mine': value cannot be traced"):
