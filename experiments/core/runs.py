@@ -21,7 +21,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments.core.artifacts import DamagedFileError, fitting, point_link, read_json, write_sealed
+from experiments.core.artifacts import DamagedFileError, UnwrittenError, fitting, point_link, read_json, write_sealed
 from experiments.core.text import MEANINGLESS, SMOKE, duration
 
 PACKAGES = ("touchr1-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "grain", "chex", "numpy")
@@ -87,7 +87,12 @@ def versions() -> dict[str, str]:
 
 def create(home: Path, description: dict[str, Any]) -> Path:
     """Make `runs/NAME/STAMP` with its `config.json`; the stamp is the time in UTC, made unique by a suffix."""
-    home.mkdir(parents=True, exist_ok=True)
+    try:
+        home.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UnwrittenError(
+            f"runs-dir is {home.parent}: must be a folder that can be written ({error}); name another by --runs-dir"
+        ) from error
     stamp = datetime.datetime.now(datetime.UTC).strftime("%Y%m%d-%H%M%S")
     for suffix in ("", *(f"-{i:02d}" for i in range(2, 100))):
         directory = home / f"{stamp}{suffix}"

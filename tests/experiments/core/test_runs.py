@@ -9,7 +9,7 @@ import threading
 import pytest
 
 from experiments.core import runs
-from experiments.core.artifacts import DamagedFileError, write_json
+from experiments.core.artifacts import DamagedFileError, UnwrittenError, write_json
 from experiments.core.runner import main
 from experiments.core.text import duration
 
@@ -53,6 +53,8 @@ def test_runs_of_one_second_get_their_own_directories(tmp_path):
     assert runs.newest(tmp_path / "coin", {}, finished=False) == sorted(made)[1]
     assert runs.newest(tmp_path / "coin", {"a": 1}, finished=False) is None
     assert runs.newest(tmp_path / "none", {}, finished=False) is None
+    with pytest.raises(UnwrittenError, match=r"runs-dir is .*results\.json: must be a folder .* name another"):
+        runs.create(max(made) / "results.json" / "coin", description)
 
 
 def make_run(home, stamp, *, results=None, total=None):

@@ -113,6 +113,12 @@ def test_options_that_make_no_sweep_are_named(vary, rest, what):
         plan(coin.EXPERIMENT, "about", vary, rest, Path("runs"), None)
 
 
+@pytest.mark.parametrize("into", [Path("s3://bucket/sweep"), Path(__file__)])
+def test_a_sweep_goes_into_a_folder_of_this_machine(into):
+    with pytest.raises(SweepError, match="into is .*: must be a folder of this machine"):
+        plan(coin.EXPERIMENT, "about", ["steps=3"], [], Path("runs"), into)
+
+
 def test_a_mistyped_option_or_value_runs_nothing(workplace, capsys):
     for vary, corrected in (("stepz=1,2", "--steps"), ("steps=1,x", "invalid|could not convert")):
         with pytest.raises(SystemExit) as stop:
