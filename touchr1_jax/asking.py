@@ -223,16 +223,17 @@ def load_policy(path: str | Path | None = None, weights: Path | None = None) -> 
     known = shipped()
     if path is None and not known:
         raise PolicyError("policy is None: none comes with this version; give the folder of one, or of a run")
-    name = str(path or known[0])
-    if name.startswith(HUB):
-        return AskablePolicy(read_saved(fetch(name.removeprefix(HUB)), weights), name)
+    name = known[0] if path is None else str(path)
     folder = SHIPPED / name if name in known else Path(name)
-    if not folder.exists():
-        names = f"one of {', '.join(known)}, " if known else ""
-        raise PolicyError(
-            f"policy is {name!r}: no such folder; must be {names}the folder of a policy or {HUB}USER/NAME"
-        )
-    return AskablePolicy(read_saved(folder, weights), name)
+    try:
+        if name.startswith(HUB):
+            folder = fetch(name.removeprefix(HUB))
+        if name and folder.exists():
+            return AskablePolicy(read_saved(folder, weights), name)
+    except OSError as error:  # a name that is too long, a file without permission
+        raise PolicyError(f"policy is {name!r}: cannot be read ({error}); correct its path or permissions") from error
+    names = f"one of {', '.join(known)}, " if known else ""
+    raise PolicyError(f"policy is {name!r}: no such folder; must be {names}the folder of a policy or {HUB}USER/NAME")
 
 
 def shipped() -> list[str]:

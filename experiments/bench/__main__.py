@@ -19,6 +19,7 @@ from experiments.core.text import number
 from sensors_io.commands.console import complain, print_in_any_encoding, progress_bar
 from sensors_io.errors import UserError
 from sensors_io.records import RecordStore
+from sensors_io.signals import end_as_interrupted, leave_interrupted
 from sensors_io.units import HERE, Launcher, finish
 from touchr1_jax.bench.items import ItemError, read_items, write_items
 from touchr1_jax.bench.json_lines import LinesError, read_lines, write_lines
@@ -271,7 +272,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KNOWN_ERRORS as error:
         complain(error)
         return 1
+    except KeyboardInterrupt as error:
+        return leave_interrupted(error, "interrupted: run the same command again")
 
 
 if __name__ == "__main__":
+    end_as_interrupted()
     sys.exit(main())

@@ -4,13 +4,14 @@ The files of a run are *sealed*: the last key of their JSON object is the CRC-32
 bit on a disk raises no error of its own.  Files without this key, such as those of earlier versions, are read as well.
 """
 
+import contextlib
 import dataclasses
 import enum
 import io
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +108,19 @@ def read_json(path: Path) -> Any:
     except ValueError as error:
         raise DamagedFileError(
             f"{path} is damaged ({error}): put a copy back, or move its run away and start a new one"
+        ) from error
+
+
+@contextlib.contextmanager
+def fitting(path: Path | str) -> Iterator[None]:
+    """`DamagedFileError` that names a file of a run, where its contents raise an error by their shape in the block."""
+    try:
+        yield
+    except DamagedFileError:
+        raise
+    except (LookupError, TypeError, AttributeError, ValueError, OverflowError) as error:
+        raise DamagedFileError(
+            f"{path} is not that of a run ({error!r}): put a copy back, or move its run away"
         ) from error
 
 

@@ -4,6 +4,7 @@ import ast
 import dataclasses
 import difflib
 import importlib.util
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
@@ -85,6 +86,10 @@ class ListCommand:
         if self.name and self.name not in entries:
             print_error(unknown_name(self.name, entries))
             return 2
+        begun = self.runs_dir != ListCommand.runs_dir or os.path.lexists(self.runs_dir)  # the first run makes it
+        if begun and not self.runs_dir.is_dir():
+            print_error(f"runs-dir is {self.runs_dir}: must be a folder of this machine; correct the path")
+            return 2
         if self.name:
             print_lines(*_listing_of_runs(self.name, entries[self.name].question, self.runs_dir))
         else:
@@ -160,7 +165,7 @@ class ShowCommand:
 
         try:
             lines = show_recorded(self.name, entries[self.name].module, self.runs_dir)
-        except FigureError as error:
+        except (FigureError, DamagedFileError) as error:
             print_error(f"{type(error).__name__}: {error}")
             return 1
         print_lines(*lines)

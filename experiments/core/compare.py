@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from experiments.core.artifacts import DamagedFileError
+from experiments.core.artifacts import fitting
 from experiments.core.runs import PastRun, continuing
 from experiments.core.text import ABSENT, aligned, bounds, duration, interval, number
 from touchr1_jax.bench.statistics import student_interval
@@ -67,7 +67,7 @@ def compare_runs(runs: Sequence[PastRun], most: int) -> str:
             "compare runs of one experiment"
         )
     settings = [{"scale": r.description["scale"]} | r.description["config"] for r in runs]
-    code = [{"code": r.code} | r.description["versions"] | r.description["machine"] for r in runs]
+    code = [{"code": r.code} | r.description.get("versions", {}) | r.description.get("machine", {}) for r in runs]
     cost = (
         f"{name} {ABSENT if run.seconds is None else duration(run.seconds)}"
         for name, run in zip(names, runs, strict=True)
@@ -105,10 +105,8 @@ def figures(results: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
       DamagedFileError: results that are not those of a run.
     """
-    try:
+    with fitting("results.json"):
         return _figures(results)
-    except (LookupError, TypeError, AttributeError, ValueError) as error:
-        raise DamagedFileError(f"results.json is not that of a run ({error!r}): put a copy back") from error
 
 
 def _figures(results: Mapping[str, Any]) -> dict[str, Any]:
@@ -122,8 +120,9 @@ def _figures(results: Mapping[str, Any]) -> dict[str, Any]:
             label = str(name) if again == 1 else f"{name} #{again}"
             for column, cell in zip(table["columns"][1:], cells, strict=True):
                 found[f"{table['title']} | {label} | {column['name']}"] = cell
-    if any(isinstance(x, Mapping) and not {"mean", "ci95", "per_seed"} <= x.keys() for x in found.values()):
-        raise ValueError("an estimate without mean, ci95 or per_seed")
+    for estimate in (x for x in found.values() if isinstance(x, Mapping)):
+        low, high = estimate["ci95"]
+        math.fsum((estimate["mean"], low, high, *estimate["per_seed"]))  # raises an error unless all are numbers
     return found
 
 

@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.core.artifacts import read_json, write_json, write_text
+from experiments.core.artifacts import DamagedFileError, fitting, read_json, write_json, write_text
 from experiments.core.report import write_report
 from experiments.core.results import from_json
 from experiments.core.runs import ROOT, PastRun
@@ -45,7 +45,8 @@ def record(run: Path, root: Path = ROOT) -> Path:
     if not (run / "results.json").exists():
         raise FigureError(f"run is {run}: holds no results.json; finish it first")
     results = read_json(run / "results.json")
-    path = root / RECORDED / f"{results['experiment']}.json"
+    with fitting(run / "results.json"):
+        path = root / RECORDED / f"{results['experiment']}.json"
     write_json(path, _placeless(results))
     return path
 
@@ -64,10 +65,11 @@ def show_recorded(name: str, module: str, runs_dir: Path) -> tuple[str, ...]:
     past = recorded_run(name, runs_dir)
     source = ROOT / Path(*module.split(".")).with_suffix(".py")
     about = ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))) or name
-    results = from_json(past.results or {})
     note = f"Recorded are figures alone; curves, pictures and examples come with a run: make experiment EXP={name}."
-    report = write_report(past.directory, results, about=about, description=past.description, note=note)
-    return (f"report: {report}", *results.verdict)
+    with fitting(RECORDED / f"{name}.json"):
+        results = from_json(past.results or {})
+        report = write_report(past.directory, results, about=about, description=past.description, note=note)
+        return (f"report: {report}", *results.verdict)
 
 
 def recorded_names(root: Path = ROOT) -> list[str]:
@@ -81,9 +83,10 @@ def recorded_run(name: str, runs_dir: Path, root: Path = ROOT) -> PastRun:
     Only `show_recorded` makes that folder, with a page and the charts that the results hold.
     """
     found = _read(name, root)
-    commit, _, dirty = found["git"].partition("-")
-    git = {"commit": commit, "dirty": bool(dirty)}
-    description = {"experiment": name, "scale": found["scale"], "git": git, "config": found["config"]}
+    with fitting(RECORDED / f"{name}.json"):
+        commit, _, dirty = found["git"].partition("-")
+        git = {"commit": commit, "dirty": bool(dirty)}
+        description = {"experiment": name, "scale": found["scale"], "git": git, "config": found["config"]}
     directory = runs_dir / name / RECORDED_RUN
     return PastRun(directory=directory, description=description, seconds=None, results=found, in_use=False)
 
@@ -160,7 +163,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             record(chosen.run)
         else:
             write_text(readme, filled(readme.read_text(encoding="utf-8")))
-    except FigureError as error:
+    except (FigureError, DamagedFileError, OSError) as error:
         sys.stderr.write(f"{error}\n")
         return 1
     return 0

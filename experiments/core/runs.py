@@ -21,7 +21,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments.core.artifacts import DamagedFileError, point_link, read_json, write_sealed
+from experiments.core.artifacts import DamagedFileError, UnwrittenError, fitting, point_link, read_json, write_sealed
 from experiments.core.text import MEANINGLESS, SMOKE, duration
 
 PACKAGES = ("touchr1-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "grain", "chex", "numpy")
@@ -87,7 +87,12 @@ def versions() -> dict[str, str]:
 
 def create(home: Path, description: dict[str, Any]) -> Path:
     """Make `runs/NAME/STAMP` with its `config.json`; the stamp is the time in UTC, made unique by a suffix."""
-    home.mkdir(parents=True, exist_ok=True)
+    try:
+        home.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UnwrittenError(
+            f"runs-dir is {home.parent}: must be a folder that can be written ({error}); name another by --runs-dir"
+        ) from error
     stamp = datetime.datetime.now(datetime.UTC).strftime("%Y%m%d-%H%M%S")
     for suffix in ("", *(f"-{i:02d}" for i in range(2, 100))):
         directory = home / f"{stamp}{suffix}"
@@ -169,11 +174,11 @@ def _describes_run(found: Any) -> bool:
     """True of what `describe` makes, by its names and the types of what is shown of it."""
     if not isinstance(found, dict) or not found.keys() >= FIELDS:
         return False
-    git, versions = found["git"], found.get("versions", {})
+    git, parts = found["git"], (found["config"], found.get("versions", {}), found.get("machine", {}))
     if not isinstance(git, dict) or git.keys() != {f.name for f in dataclasses.fields(Revision)}:
         return False
     words = (*(found[name] for name in ("experiment", "scale", "command")), git["commit"])
-    return isinstance(versions, dict) and all(isinstance(word, str) for word in words)
+    return all(isinstance(part, dict) for part in parts) and all(isinstance(word, str) for word in words)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -230,13 +235,18 @@ def read_run(directory: Path) -> PastRun:
     path, times, results = (directory / f"{name}.json" for name in ("config", "timing", "results"))
     if not path.exists():
         raise FileNotFoundError(f"{directory} holds no config.json: must be the directory of a run; correct the path")
-    return PastRun(
+    run = PastRun(
         directory=directory,
         description=read_description(directory),
         seconds=_object(times).get("total") if times.exists() else None,  # stages come before the total
         results=_object(results, "verdict") if results.exists() else None,
         in_use=_in_use(directory),
     )
+    with fitting(times):
+        _ = run.summary
+    with fitting(results):
+        " ".join(run.outcome)
+    return run
 
 
 def _object(path: Path, *lists: str) -> dict[str, Any]:

@@ -4,9 +4,14 @@ import dataclasses
 from collections.abc import Collection, Iterator
 from typing import Any
 
+INT32_MAX = 2**31 - 1  # of the whole numbers that arrays, seeds and sizes are made of
+
+LARGER = 1000
+"""A setting that may be above `INT32_MAX`, such as bytes, is at most so many times that of a scale."""
+
 
 def require_sizes(config: Any, scales: Collection[Any]) -> None:
-    """Refuse what no scale has: numbers below 0 where none is, and no steps, seeds or rounds where all have some.
+    """Refuse what no scale has: numbers below 0 where none is, no steps, seeds or rounds where all have some, overflow.
 
     What a class checks by itself is left to it, and a seed may be 0.
 
@@ -21,7 +26,10 @@ def require_sizes(config: Any, scales: Collection[Any]) -> None:
     for path, (value, owner) in _leaves(config).items():
         others = [scale[path][0] for scale in usual if path in scale]
         numbers = [x for x in _several(value) if _is_number(x)]
-        least = min((x for other in others for x in _several(other) if _is_number(x)), default=None)
+        known = [x for other in others for x in _several(other) if _is_number(x)]
+        least, most = min(known, default=None), max(INT32_MAX, LARGER * max(known, default=0))
+        if any(isinstance(x, int) and x > most for x in numbers):
+            raise ValueError(f"{path} is {value}: must be at most {most:.0f}; lower it")
         if least is not None and least >= 0 and any(x < 0 for x in numbers):
             raise ValueError(f"{path} is {value}: must be at least 0; raise it")
         counts = isinstance(value, int) and least is not None and least >= 1 and not path.endswith("seed")

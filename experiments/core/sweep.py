@@ -30,6 +30,7 @@ from experiments.core.results import Cell, Column, Estimate, Picture, Results, T
 from experiments.core.runner import Experiment, load, parse, run_experiment
 from experiments.core.sweep_figures import chart, chosen_figures, number_of
 from sensors_io.errors import UserError
+from sensors_io.remote import at_url
 from sensors_io.signals import exit_status
 from sensors_io.units import HERE, Launcher, LauncherError, UnitsError, WorkUnit, finish
 from touchr1_jax.bench.scoring import REPORTED
@@ -156,7 +157,7 @@ def plan(
       into: the folder; by default named after the units, so that the same sweep goes on in it.
 
     Raises:
-      SweepError: as `options_of`; an option that a sweep gives itself, or two units of one configuration.
+      SweepError: as `options_of`; an option that a sweep gives itself, two units of one configuration, or no folder.
       SystemExit: code 2 after the correction of an option or a value that the experiment does not know.
     """
     varied, planned = options_of(vary), dict[str, tuple[dict[str, str], tuple[str, ...], Any]]()
@@ -175,6 +176,8 @@ def plan(
         planned[digest] = settings, words, config
     name = f"{experiment.name}-{hashlib.sha256(''.join(sorted(planned)).encode()).hexdigest()[:DIGITS]}"
     folder = into or runs_dir / FOLDERS / name
+    if at_url(folder) or (folder.exists() and not folder.is_dir()):
+        raise SweepError(f"into is {folder}: must be a folder of this machine; name another by --into")
     return folder, tuple(
         SweepUnit(
             digest=digest,

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.core import runs
-from experiments.core.artifacts import DamagedFileError, jsonable, read_json
+from experiments.core.artifacts import fitting, jsonable, read_json
 from experiments.core.context import Context
 from experiments.core.text import bounds, number
 from experiments.study.dataset import Dataset
@@ -93,11 +93,8 @@ def measured_figures(name: str, runs_dir: Path) -> dict[str, str]:
     results = None if folder is None else folder.parents[2] / "results.json"
     if folder is None or results is None or not results.exists():
         return {}
-    found = read_json(results)
-    try:
-        return _measured(found, folder.parent.name)
-    except (AttributeError, ValueError, TypeError, LookupError) as error:
-        raise DamagedFileError(f"{results} is not that of a run ({error!r}): put a copy back") from error
+    with fitting(results):
+        return _measured(read_json(results), folder.parent.name)
 
 
 def _measured(found: Any, arm: str) -> dict[str, str]:

@@ -18,7 +18,7 @@ class TouchInput:
     Attributes:
       frames: sensor → RGB pictures in the order of time, uint8 [F, H, W, 3], at most as many as the policy reads.
       force_n: sensor → force on the gel, pressing is z < 0, float [F, 3]; absent where it was not measured.
-      index: sensor → position of each frame in its recording, int [F]; 0, 1, … by default.
+      index: sensor → position of each frame in its recording, int [F], increasing; 0, 1, … by default.
       view: RGB picture of the object, uint8 [H, W, 3], or `None`.
     """
 
@@ -32,8 +32,8 @@ def clip_arrays(touch: TouchInput, saved: SavedPolicy) -> dict[str, np.ndarray]:
     """The arrays of `TouchBatch` for one touch, without P: pictures resized, absent streams and frames masked.
 
     Raises:
-      QuestionError: no sensor or an unknown one, arrays of other shapes or types, numbers that are not finite, or more
-        frames than the policy reads.
+      QuestionError: no sensor or an unknown one, arrays of other shapes or types, numbers that are not finite, an
+        index that does not increase, or more frames than the policy reads.
     """
     model, sensors = saved.model, saved.sensors
     for field in ("frames", "force_n", "index"):
@@ -104,6 +104,8 @@ def _checked(touch: TouchInput, sensor: str, most: int) -> tuple[np.ndarray, np.
             f"force_n[{sensor}] and index[{sensor}] must be finite numbers (float32) and whole numbers ≥ 0 (int32); "
             "leave a force out that was not measured"
         )
+    if not (index[1:] > index[:-1]).all():
+        raise QuestionError(f"index[{sensor}] is {index}: must increase with time; sort the frames, each once")
     return frames, force, index
 
 

@@ -8,6 +8,7 @@ python -m touchr1_jax.rewards adversary --prior 0.5 0.3 0.2
 
 import dataclasses
 import itertools
+import signal
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated
@@ -35,6 +36,7 @@ from touchr1_jax.text.language import TOUCH_LANGUAGE, Language
 from touchr1_jax.text.lexer import tags_of
 from touchr1_jax.text.oracle import Reading, read
 from touchr1_jax.types import Parsed, Target
+from touchr1_jax.validation import at_least, within
 
 PUBLISHED: Mapping[str, float] = {"accuracy": 0.6, "consistency": 0.3, "format": 0.1}
 """Weights of Touch-R1 (arXiv 2605.27154)."""
@@ -47,6 +49,9 @@ NOT_DEFINED = "does not apply"
 
 MOST_TRUTHS = 100
 """Largest number of label combinations in a table."""
+
+MOST_TOKENS = 100_000
+"""Longest completion; those of released models have some thousands."""
 
 WIDTH = 110
 """Columns of the output where it is no terminal."""
@@ -99,6 +104,9 @@ class ExplainAnswer:
         rewards, weights = all_rewards(language), self.weights or PUBLISHED
         try:
             check_weights(rewards, weights)
+            within(self, 1, MOST_TOKENS, "longest")
+            if self.length is not None:
+                within(self, 0, MOST_TOKENS, "length")
             reading = read(language, self.text)
             asked = self._asked(language, reading)
             streams = self._streams(language, reading)
@@ -287,14 +295,16 @@ class SearchAnswers:
     def run(self) -> int:
         """Print a table for each set of rewards and return the exit status: 0 if the last one has no such answer."""
         sets = {"chosen": self.weights} if self.weights else {"paper": PUBLISHED, "stable": stable_weights(PUBLISHED)}
-        rewards = make_rewards(with_prior(self.prior))
         better: list[tuple[AnswerProgram, float]] = []
-        for name, weights in sets.items():
-            try:
-                found = earnings(rewards, weights, self.prior)
-            except ValueError as error:
-                _console(stderr=True).print(f"{type(error).__name__}: {error}", markup=False, soft_wrap=True)
-                return 1
+        try:
+            within(self, 0, 1, "accuracy")
+            at_least(self, 0, "most")
+            rewards = make_rewards(with_prior(self.prior))
+            earned = {name: earnings(rewards, weights, self.prior) for name, weights in sets.items()}
+        except ValueError as error:
+            _console(stderr=True).print(f"{type(error).__name__}: {error}", markup=False, soft_wrap=True)
+            return 1
+        for name, found in earned.items():
             better, honest = found.better(self.accuracy), found.expected(self.accuracy)[-1]
             total = f"{len(better)} of {len(programs())} answers earn more than the honest one, {honest:.3f}"
             table = Table("layout: perceive → compare → conclude", "earns", "more by", title=f"{name}: {total}")
@@ -316,7 +326,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command = tyro.cli(
         Command, args=arguments, prog="python -m touchr1_jax.rewards", config=(tyro.conf.OmitArgPrefixes,)
     )
-    return command.run()
+    try:
+        return command.run()
+    except KeyboardInterrupt:
+        return 128 + signal.SIGINT  # as shells have it
+    except OSError as error:
+        sys.stderr.write(f"{type(error).__name__}: {error}: let standard output lead to something that takes text\n")
+        return 1
 
 
 if __name__ == "__main__":

@@ -1,6 +1,5 @@
 """The types of rewards, and the weighted sum of rewards."""
 
-import math
 import traceback
 from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple
@@ -21,6 +20,9 @@ Segment = Literal["perceive", "compare", "conclude"]
 
 GROUP = "group"
 """Name of the `vmap` axis over the rollouts of one prompt."""
+
+SMALLEST_WEIGHT, LARGEST_WEIGHT = 1e-9, 1e9
+"""Range of a weight above 0: squares of rewards stay within float32."""
 
 
 class RewardError(ValueError):
@@ -174,17 +176,18 @@ def check_weights(rewards: Mapping[str, AnyReward], weights: Mapping[str, float]
     """Check the names and sizes of weights.
 
     Raises:
-      RewardError: an unknown name, an entry that is no `Reward`, a weight that is negative or not finite, or none above
-        0.
+      RewardError: an unknown name, an entry that is no `Reward`, a weight that is negative or beyond float32, or none
+        above 0.
     """
     for name, weight in weights.items():
         if name not in rewards:
             raise RewardError(f"weights: no reward is called {name!r}; choose from {', '.join(sorted(rewards))}")
         if not isinstance(rewards[name], AnyReward):
             raise RewardError(f"rewards[{name}] is {rewards[name]!r}: must be a Reward; write Reward(function)")
-        if not (math.isfinite(weight) and weight >= 0):
+        if not (weight == 0 or SMALLEST_WEIGHT <= weight <= LARGEST_WEIGHT):
             raise RewardError(
-                f"weights[{name}] is {weight}: must be finite and ≥ 0; let a penalty have a negative value"
+                f"weights[{name}] is {weight}: must be finite and ≥ 0, and {SMALLEST_WEIGHT} … {LARGEST_WEIGHT} if "
+                "not 0; let a penalty have a negative value"
             )
     if not any(weights.values()):
         raise RewardError(f"weights is {dict(weights)}: at least one must be above 0; give a reward some weight")

@@ -122,6 +122,8 @@ def test_plain_arrays_are_enough_and_misfits_are_named(asked):
         (TouchInput(frames=frames, force_n={"tac3d": np.full((3, 3), 1e300)}), "must be finite numbers"),
         (TouchInput(frames=frames, force_n={"tac3d": np.full((3, 3), "1")}), "must be finite numbers"),
         (TouchInput(frames=frames, index={"tac3d": np.arange(3) + 2**40}), "whole numbers ≥ 0"),
+        (TouchInput(frames=frames, index={"tac3d": np.array([0, 2, 1], np.uint32)}), r"\[0 2 1\]: must increase"),
+        (TouchInput(frames=frames, index={"tac3d": np.array([0, 1, 1])}), r"\[0 1 1\]: must increase"),
     ):
         with pytest.raises(QuestionError, match=message):
             asked.ask(wrong, "How hard is it?")

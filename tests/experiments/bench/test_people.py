@@ -2,10 +2,11 @@
 
 import csv
 import json
+from unittest.mock import Mock
 
 import pytest
 
-from experiments.bench.__main__ import main
+from experiments.bench.__main__ import AnnotateSheets, main
 from experiments.core.artifacts import read_json, write_json
 from sensors_io.records import RecordStore
 from touchr1_jax.bench.items import write_items
@@ -135,6 +136,11 @@ def test_pass_rates_by_hand(items, source, tmp_path):
     assert rows["all three"].by_object.low <= 0.95 <= rows["all three"].by_object.high
     agree = audit.judge_agreement(judged, {n: row | {"grounded": True} for n, row in judged.items()})
     assert agree == {"grounded": pytest.approx(0), "fits the labels": None, "self-consistent": 1.0}
+
+
+def test_ctrl_c_leaves_no_traceback(monkeypatch):
+    monkeypatch.setattr(AnnotateSheets, "run", Mock(side_effect=KeyboardInterrupt))
+    assert main(["annotate-sheets", "records", "--out", "labels"]) == 130
 
 
 def test_annotation_by_command(tmp_path, records, capsys):

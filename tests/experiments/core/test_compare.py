@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.core.artifacts import read_json, write_sealed
+from experiments.core.artifacts import DamagedFileError, read_json, write_sealed
 from experiments.core.compare import compare_results
 from experiments.core.runner import main
 
@@ -59,6 +59,12 @@ def test_requirements_and_cells_of_tables():
         "Errors | spg #2 | error": ("", "differs"),
         "Errors | spg #2 | converged": ("", "same"),
     }
+
+
+@pytest.mark.parametrize("changed", [{"ci95": ["a"]}, {"ci95": [1, [2]]}, {"mean": ""}, {"per_seed": 7}])
+def test_an_estimate_of_other_types_is_damage(changed):
+    with pytest.raises(DamagedFileError, match=r"results\.json is not that of a run"):
+        figures({}, {"arms": {"x": {"acc": estimate(1, 2) | changed}}})
 
 
 def test_of_several_runs_shared_figures_are_judged_against_the_first():

@@ -4,9 +4,20 @@ import re
 
 import pytest
 
-from experiments.core.artifacts import read_json, write_json
+from experiments.core.artifacts import DamagedFileError, read_json, write_json
 from experiments.core.commands import run_command
-from experiments.core.recorded import BEGIN, END, RECORDED, TABLE, FigureError, figure, filled, main, record
+from experiments.core.recorded import (
+    BEGIN,
+    END,
+    RECORDED,
+    TABLE,
+    FigureError,
+    figure,
+    filled,
+    main,
+    record,
+    recorded_run,
+)
 from experiments.core.runs import ROOT
 
 RESULTS = {
@@ -60,6 +71,12 @@ def test_a_finished_run_is_recorded_whole_but_for_paths_of_the_machine(root, tmp
     assert recorded == RESULTS | {"config": {"data_dir": "x", "paths": ["b.npz", "1/2", "/"]}}
     assert main(["record", str(tmp_path)]) == 1
     assert "finish it first" in capsys.readouterr().err
+    with pytest.raises(DamagedFileError, match=r"coin\.json is not that of a run .*'git'"):
+        recorded_run("coin", tmp_path, root)
+    for damaged in ("{", "[]"):
+        (tmp_path / "results.json").write_text(damaged)
+        assert main(["record", str(tmp_path)]) == 1
+        assert "results.json is" in capsys.readouterr().err
 
 
 def test_a_recorded_run_is_shown_as_its_report(tmp_path, capsys):

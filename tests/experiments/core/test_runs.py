@@ -9,7 +9,7 @@ import threading
 import pytest
 
 from experiments.core import runs
-from experiments.core.artifacts import DamagedFileError, write_json
+from experiments.core.artifacts import DamagedFileError, UnwrittenError, write_json
 from experiments.core.runner import main
 from experiments.core.text import duration
 
@@ -53,6 +53,8 @@ def test_runs_of_one_second_get_their_own_directories(tmp_path):
     assert runs.newest(tmp_path / "coin", {}, finished=False) == sorted(made)[1]
     assert runs.newest(tmp_path / "coin", {"a": 1}, finished=False) is None
     assert runs.newest(tmp_path / "none", {}, finished=False) is None
+    with pytest.raises(UnwrittenError, match=r"runs-dir is .*results\.json: must be a folder .* name another"):
+        runs.create(max(made) / "results.json" / "coin", description)
 
 
 def make_run(home, stamp, *, results=None, total=None):
@@ -118,8 +120,10 @@ def test_a_damaged_run_hides_no_other(tmp_path, capsys):
     ("file", "content"),
     [
         *(("config.json", text) for text in ("{}", "[]", "7", '{"config": {}}', FOREIGN % "3", FOREIGN % "{}")),
-        *(("results.json", text) for text in ("{}", "1", '{"verdict": 2}')),
+        *(("results.json", text) for text in ("{}", "1", '{"verdict": 2}', '{"verdict": [2]}')),
+        ("results.json", '{"verdict": [], "requirements": [1]}'),
         ("timing.json", "[]"),
+        ("timing.json", '{"total": NaN}'),
     ],
 )
 def test_a_foreign_file_is_named(tmp_path, file, content):
@@ -161,3 +165,7 @@ def test_an_experiment_without_runs_and_an_unknown_one_are_named(tmp_path, capsy
     assert f"has not run under {tmp_path}" in capsys.readouterr().out
     assert main(["list", "coyn", "--runs-dir", str(tmp_path)], package=FAKES) == 2
     assert "Did you mean coin?" in capsys.readouterr().err
+    (tmp_path / "file").touch()
+    for wrong in (str(tmp_path / "file"), str(tmp_path / "nowhere"), "s3://bucket/runs"):
+        assert main(["list", "--runs-dir", wrong], package=FAKES) == 2
+        assert "must be a folder of this machine" in capsys.readouterr().err

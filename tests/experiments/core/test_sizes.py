@@ -48,6 +48,7 @@ SCALES = (Config(), Config(training=Training(shift=-1.0), moments=0))
         ({"steps": 0}, "training.steps is 0: must be at least 1; raise it"),
         ({"rate": -0.1}, "training.rate is -0.1: must be at least 0; raise it"),
         ({"forces": (1.0, -5.0)}, r"training.forces is \(1.0, -5.0\): must be at least 0; raise it"),
+        ({"steps": 10**21}, "training.steps is 1000000000000000000000: must be at most 2147483647; lower it"),
         ({"first_seed": -1}, "training.first_seed is -1: must be at least 0; raise it"),
     ],
 )
@@ -59,6 +60,8 @@ def test_what_no_scale_has_is_refused(change, said):
 def test_what_a_scale_has_or_a_class_checks_itself_is_taken():
     training = Training(shift=-3.0, first_seed=0, rate=0.0, forces=(0.0,), kept=False)
     require_sizes(Config(training=training, checked=Checked(steps=0), moments=0, most=-1), SCALES)
+    many = Config(moments=10**9)
+    require_sizes(dataclasses.replace(many, moments=10**12), (many,))
 
 
 @pytest.mark.parametrize(

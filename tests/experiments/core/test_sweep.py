@@ -113,6 +113,12 @@ def test_options_that_make_no_sweep_are_named(vary, rest, what):
         plan(coin.EXPERIMENT, "about", vary, rest, Path("runs"), None)
 
 
+@pytest.mark.parametrize("into", ["s3://bucket/sweep", __file__])
+def test_a_sweep_goes_into_a_folder_of_this_machine(into):
+    with pytest.raises(SweepError, match=r"into is .*: must be a folder of this machine"):
+        plan(coin.EXPERIMENT, "about", ["steps=3"], [], Path("runs"), Path(into))
+
+
 def test_a_mistyped_option_or_value_runs_nothing(workplace, capsys):
     for vary, corrected in (("stepz=1,2", "--steps"), ("steps=1,x", "invalid|could not convert")):
         with pytest.raises(SystemExit) as stop:
@@ -149,5 +155,5 @@ def test_two_sweeps_at_once_do_not_write_into_one_folder(workplace, capsys):
     assert said in capsys.readouterr().err
     assert [path.name for path in Path("mine").iterdir()] == [".lock"]
     Path("file").touch()
-    assert sweep((*arguments[:-1], "file"), package=FAKES) == 1
-    assert "Error: " in capsys.readouterr().err
+    assert sweep((*arguments[:-1], "file"), package=FAKES) == 2
+    assert "into is file: must be a folder of this machine; name another by --into" in capsys.readouterr().err

@@ -265,6 +265,12 @@ def test_what_is_no_policy_is_named(folder, message):
         load_policy(folder)
 
 
+@pytest.mark.parametrize("name", ["", 0, [], False, "n" * 5000])
+def test_a_name_of_nothing_is_no_policy(name):
+    with pytest.raises(PolicyError, match=r"policy is '.*': (no such folder; must be|cannot be read)"):
+        load_policy(name)
+
+
 def test_a_link_to_a_policy_stays_a_link(saved, folder):
     link = folder.with_name("link")
     link.symlink_to(folder.name)

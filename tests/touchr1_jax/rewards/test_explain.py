@@ -1,12 +1,14 @@
 """`python -m touchr1_jax.rewards`: an answer's slots, terms and total, and errors of arguments."""
 
+from unittest.mock import Mock
+
 import jax.numpy as jnp
 import pytest
 
 from experiments.study.scores import PUBLISHED as REPORTED
 from tests.touchr1_jax.rewards.examples import make_parsed, make_target
 from touchr1_jax.rewards import Reward, RewardError, make_rewards, uniform_prior
-from touchr1_jax.rewards.__main__ import PUBLISHED, main, terms_table
+from touchr1_jax.rewards.__main__ import PUBLISHED, ListRewards, main, terms_table
 
 ANSWER = "<perceive> gelsight_mini soft xense firm </perceive> <compare> soft </compare> <conclude> firm </conclude>"
 
@@ -95,6 +97,29 @@ def test_words_of_another_language_are_answered_with_those_that_count(capsys):
 def test_wrong_arguments_are_named(capsys, arguments, message):
     assert main(["explain", *arguments]) == 1
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["explain", "--text", ANSWER, "--length", "-1"], "length is -1: must lie in 0 … "),
+        (["explain", "--text", ANSWER, "--length", "2147483648"], "length is 2147483648: must lie in 0 … "),
+        (["explain", "--text", ANSWER, "--longest", "0"], "longest is 0: must lie in 1 … "),
+        (["explain", "--text", ANSWER, "--weights", "accuracy", "1e300"], "weights[accuracy] is 1e+300: must be"),
+        (["adversary", "--prior", "1", "1", "1"], "must be ≥ 0 and sum to 1"),
+        (["adversary", "--accuracy", "nan"], "accuracy is nan: must lie in 0 … 1"),
+        (["adversary", "--most", "-1"], "most is -1: must be at least 0"),
+    ],
+)
+def test_a_number_out_of_range_is_refused(capsys, arguments, message):
+    assert main(arguments) == 1
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt, 130), (OSError("full"), 1)])
+def test_ctrl_c_and_a_full_disk_leave_no_traceback(monkeypatch, error, status):
+    monkeypatch.setattr(ListRewards, "run", Mock(side_effect=error))
+    assert main(["list"]) == status
 
 
 def test_what_cannot_be_trained_is_not_explained():
