@@ -275,8 +275,8 @@ def _in_use(directory: Path) -> bool:
 
 
 def locate(name: str, runs_dir: Path) -> Path:
-    """Directory of a run by its path, by `NAME/STAMP`, or by `NAME` for the latest; `FileNotFoundError` without one."""
-    for directory in (Path(name), Path(name) / "latest", runs_dir / name, runs_dir / name / "latest"):
+    """Directory of a run by `NAME/STAMP`, `NAME` for the latest, or its path; `FileNotFoundError` without one."""
+    for directory in (runs_dir / name, runs_dir / name / "latest", Path(name), Path(name) / "latest"):
         if (directory / "config.json").exists():
             return directory.resolve()
     raise FileNotFoundError(
