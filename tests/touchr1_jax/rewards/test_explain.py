@@ -35,6 +35,7 @@ def test_slots_terms_and_total_by_hand(capsys):
     rows = explain(capsys, "--label", "hardness", "soft")
     assert ["perceive xense", "firm"] in rows
     assert ["perceive tac3d", "⊥"] in rows
+    assert ["compare", "soft"] in rows
     assert ["conclude", "firm"] in rows
     assert ["formatted: yes"] in rows
     assert ["length: 12, truncated: no"] in rows
@@ -95,6 +96,11 @@ def test_words_of_another_language_are_answered_with_those_that_count(capsys):
 def test_wrong_arguments_are_named(capsys, arguments, message):
     assert main(["explain", *arguments]) == 1
     assert message in capsys.readouterr().err
+
+
+def test_wrong_arguments_of_the_search_are_named(capsys):
+    assert main(["adversary", "--weights", "[brevty]", "1"]) == 1
+    assert "no reward is called '[brevty]'" in capsys.readouterr().err
 
 
 def test_what_cannot_be_trained_is_not_explained():
