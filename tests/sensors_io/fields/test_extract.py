@@ -31,10 +31,10 @@ def dotted(shift: float = 0.0) -> np.ndarray:
     return cv2.GaussianBlur(picture, (0, 0), 0.8)
 
 
-def touched(background: np.ndarray) -> np.ndarray:
-    """A bump of light at the centre, odd in x as a slope is."""
+def touched(background: np.ndarray, at_px: int = 107) -> np.ndarray:
+    """A bump of light at the centre, or at another x, odd in x as a slope is."""
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
-    dx, dy = (x - 107) / 14, (y - 80) / 14
+    dx, dy = (x - at_px) / 14, (y - 80) / 14
     shade = 90 * dx * np.exp(-(dx**2 + dy**2) / 2)
     return np.clip(background + shade[..., None] * np.array([1.0, 0.3, -0.7]), 0, 255).astype(np.uint8)
 
@@ -55,12 +55,13 @@ def calibration(background: np.ndarray, mm_per_px: float = 0.1) -> Calibration:
 def test_a_bare_gel_gives_depth_and_is_refused_shear() -> None:
     extractor = Extractor(bare(), 0.1, calibration(bare()))
     assert Flag.NO_ZERO_LEVEL in extractor.judged
-    fields = extractor.extract(np.stack([bare(), touched(bare())]))
+    fields = extractor.extract(np.stack([bare(), touched(bare()), touched(touched(bare(), 50), 164)]))
     assert fields.depth_mm is not None
-    assert fields.depth_mm.shape == fields.contact.shape == (2, *SHAPE)
+    assert fields.depth_mm.shape == fields.contact.shape == (3, *SHAPE)
     assert fields.deformation_mm is fields.shear_mm is None
     assert (fields.flags & np.uint32(Flag.REFUSED)).all()
-    assert [bool(f & Flag.NO_CONTACT) for f in fields.flags.tolist()] == [True, False]
+    assert [bool(f & Flag.NO_CONTACT) for f in fields.flags.tolist()] == [True, False, False]
+    assert [bool(f & Flag.SEVERAL_CONTACTS) for f in fields.flags.tolist()] == [False, False, True]
     assert "deformation_mm, shear_mm" in extractor.refused[0]
 
 
@@ -102,6 +103,7 @@ def test_a_marker_gel_with_calibration_gives_everything() -> None:
 
 def test_what_does_not_fit_together_is_refused() -> None:
     refused(CalibrationError, "must be equal; calibrate", lambda: Extractor(bare(), 0.2, calibration(bare())))
+    refused(CalibrationError, "mm_per_px is 1.0: must lie in", calibration, bare(), 1.0)
     contact, flags = np.zeros((2, 4, 5), bool), np.zeros(2, np.uint32)
     wrong = np.zeros((2, 4, 6), np.float32)
     refused(SchemaError, "depth_mm", Fields, contact=contact, flags=flags, mm_per_px=0.1, depth_mm=wrong)

@@ -70,6 +70,8 @@ def test_pressing_nodes_alone_carry_the_load(inverse, noisy):
     np.testing.assert_allclose(total_force(found.traction_mpa, GRID.pitch_mm), true, atol=0.06 * abs(true[2]))
     assert np.all(found.traction_mpa[..., 2] <= 0)
     assert np.all(found.traction_mpa[0] == 0)
+    anywhere = inverse.contact(noisy[..., :2], noisy[..., 2], np.ones((SIDE, SIDE), bool)).traction_mpa
+    assert not anywhere[anywhere[..., 2] == 0].any()
 
 
 def test_shear_is_what_the_traction_makes(inverse, noisy):

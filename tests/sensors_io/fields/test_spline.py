@@ -43,10 +43,10 @@ def test_contradicting_points_are_taken_out_and_no_others():
 
 def test_too_few_points_contradict_nothing():
     """Noise in place of markers; the energy of fewer than three has no inverse."""
-    square = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [10.0, 10.0]])
-    for count in range(4):
-        found = np.arange(4) < count
-        assert not ThinPlate(square, 1e-3).inconsistent(DISPLACEMENT[:4], found, 1.0).any()
+    square = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [10.0, 10.0], [4.0, 5.0]])
+    for count in range(6):
+        found = np.arange(5) < count
+        assert ThinPlate(square, 1e-3).inconsistent(DISPLACEMENT[:5], found, 0.0).sum() == max(count - 4, 0)
 
 
 def test_leave_one_out_is_that_of_a_fit_without_the_point():

@@ -72,6 +72,8 @@ def test_the_spread_follows_the_noise_as_documented():
 def test_wrong_pictures_are_refused(tracker):
     refused(ValueError, r"must be uint8\[160, 200\]", tracker.track, REST[:-1])
     refused(ValueError, "must lie inside the picture", lambda: Patches(REST, np.array([[3.0, 50.0]]), 7))
+    corner = Patches(REST, np.array([[192.0, 152.0]]), 7)  # the last window inside
+    assert corner.find(np.zeros_like(REST), np.array([[192.0, 152.0]])).likeness.tolist() == [0.0]
     refused(ValueError, "back_px is 0", TrackingConfig, back_px=0)
 
 

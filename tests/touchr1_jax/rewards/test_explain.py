@@ -37,6 +37,7 @@ def test_slots_terms_and_total_by_hand(capsys):
     rows = explain(capsys, "--label", "hardness", "soft")
     assert ["perceive xense", "firm"] in rows
     assert ["perceive tac3d", "⊥"] in rows
+    assert ["compare", "soft"] in rows
     assert ["conclude", "firm"] in rows
     assert ["formatted: yes"] in rows
     assert ["length: 12, truncated: no"] in rows
@@ -109,9 +110,10 @@ def test_wrong_arguments_are_named(capsys, arguments, message):
         (["adversary", "--prior", "1", "1", "1"], "must be ≥ 0 and sum to 1"),
         (["adversary", "--accuracy", "nan"], "accuracy is nan: must lie in 0 … 1"),
         (["adversary", "--most", "-1"], "most is -1: must be at least 0"),
+        (["adversary", "--weights", "[brevty]", "1"], "no reward is called '[brevty]'"),
     ],
 )
-def test_a_number_out_of_range_is_refused(capsys, arguments, message):
+def test_values_out_of_range_are_refused(capsys, arguments, message):
     assert main(arguments) == 1
     assert message in capsys.readouterr().err
 

@@ -31,7 +31,7 @@ FAILURES = {
     "A1": ({"no_action_share": 1.0}, 1.0),
     "A2": ({"one_action_share": 1.0}, 1.0),
     "A3": ({"all_actions_share": 1.0}, 1.0),
-    "A4": ({"first_kind_information": 0.02}, 0.02),
+    "A4": ({"first_kind_information": 0.02, "first_kind_peak": 0.5}, 0.02),
     "A5": ({"silent_share": 0.8}, 0.8),
 }
 

@@ -111,7 +111,7 @@ def test_the_best_of_k_is_the_mean_over_all_sets_with_a_rollout(k):
     reward = np.random.default_rng(k).choice([1.0, 0.4, 0.0, -0.1], (5, 6)).astype(np.float32)
     sets = list(itertools.combinations(range(6), k))
     expected = [[np.mean([row[list(s)].max() for s in sets if i in s]) for i in range(6)] for row in reward]
-    found = best_of(jnp.asarray(reward), k)
+    found = best_of(jnp.asarray(reward)[:, None], k)[:, 0]
     np.testing.assert_allclose(found, expected, atol=1e-6)
     np.testing.assert_allclose(
         found.mean(-1), [np.mean([row[list(s)].max() for s in sets]) for row in reward], atol=1e-6

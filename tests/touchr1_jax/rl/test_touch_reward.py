@@ -73,5 +73,9 @@ def test_prices_that_are_no_price_are_named(outcome, name, price):
 
 @pytest.mark.parametrize("prices", [Prices(jnp.float32(1), jnp.float32(0)), Prices(jnp.float32(2), jnp.float32(9))])
 def test_prices_at_which_touching_never_pays_are_named(outcome, prices):
+    """An action that observes nothing is no touch, though it is free."""
+    exists, seconds = np.array(outcome.exists), np.array(outcome.seconds)
+    exists[:, 0], seconds[:, 0] = False, 0.0
+    outcome = outcome._replace(exists=exists, seconds=seconds)
     with pytest.raises(RewardError, match="never pays"):
         check_touching_pays(priced_answer, prices, EVERY.target, outcome)
