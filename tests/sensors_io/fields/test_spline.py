@@ -42,7 +42,7 @@ def test_contradicting_points_are_taken_out_and_no_others():
 
 
 def test_too_few_points_contradict_nothing():
-    """Noise in place of markers; the energy of fewer than three has no inverse."""
+    """Noise in place of markers: of five one is taken out, of four none; fewer than three have no inverse energy."""
     square = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0], [10.0, 10.0], [4.0, 5.0]])
     for count in range(6):
         found = np.arange(5) < count

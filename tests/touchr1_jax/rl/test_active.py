@@ -1,6 +1,7 @@
 """GRPO on trajectories: its gradient is that of the expected reward, and one program serves a sweep of prices."""
 
 import dataclasses
+import types
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,14 @@ from tests.touchr1_jax import explored
 from tests.touchr1_jax.explored import BANK, BUDGET, POLICY, SHALLOW, N, T
 from touchr1_jax.models.active_policy import Explored
 from touchr1_jax.models.policy import Policy
-from touchr1_jax.rl.active import ActiveEngine, ActiveInputs, check_active_config, make_active_step, mutual_information
+from touchr1_jax.rl.active import (
+    ActiveEngine,
+    ActiveInputs,
+    check_active_config,
+    exploration_metrics,
+    make_active_step,
+    mutual_information,
+)
 from touchr1_jax.rl.config import DrGrpo, GRPOConfig, Norm, Paper, Stable
 from touchr1_jax.rl.gradient import Experience, grpo_gradient
 from touchr1_jax.rl.grpo import start_state
@@ -173,6 +181,32 @@ def test_information_of_a_question_about_a_kind():
     for nat, count in tables.items():
         np.testing.assert_allclose(mutual_information(jnp.asarray(count, jnp.float32)), nat, atol=1e-6)
     assert mutual_information(jnp.zeros((2, 2))) == 0
+
+
+def test_statistics_of_actions_by_hand():
+    """Two trajectories of each of two questions: 1, 2, 0 and 2 actions, of which one of five observes nothing."""
+    action = np.array([[[0, -1], [1, 0]], [[-1, -1], [0, 1]]])
+    exists = np.repeat((action >= 0)[..., None], 3, -1)
+    exists[0, 1, 1] = False
+    found = types.SimpleNamespace(action=action, exists=exists, seconds=np.ones((2, 2)), harm=np.zeros((2, 2)))
+    batch = types.SimpleNamespace(target=types.SimpleNamespace(asked=np.eye(2, dtype=bool)))
+    metrics = jax.jit(lambda: exploration_metrics(found, batch, ("press", "slide")))()
+    assert {name: float(value) for name, value in metrics.items()} == pytest.approx(
+        {
+            "actions": 5 / 4,
+            "seconds": 1,
+            "harm": 0,
+            "no_action_share": 1 / 4,
+            "one_action_share": 1 / 4,
+            "all_actions_share": 1 / 2,
+            "silent_share": 1 / 5,
+            "first_kind_peak": 2 / 3,
+            "first_kind_information": np.log(27 / 16) / 3,
+            "kinds": 2,
+            "questions": 2,
+            "budget": 2,
+        }
+    )
 
 
 WRONG = {
