@@ -172,7 +172,7 @@ def test_the_update_is_that_of_the_steps_own_rollouts(training, stand_in, tmp_pa
         assert own["sampler_gap_peak"] < 1e-4
         assert other["sampler_gap_peak"] < 1e-4
         assert own["reward_std"] > 0
-        for name in own:
+        for name in own.keys() - {"sampler_gap", "sampler_gap_peak"}:  # rounding alone, bounded above
             np.testing.assert_allclose(other[name], own[name], rtol=1e-4, atol=1e-5, err_msg=name)
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-5), ours.params, theirs.params)
     moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), theirs.params, training.trained)
