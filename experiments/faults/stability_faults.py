@@ -8,8 +8,8 @@ study a few times; their networks are so small that the loop takes most of the t
 unfinished run, in four ways, and single bits in all files of a study and its cache.  Bad input: about forty kinds
 through the public command lines.  Waiting: the share of a step that waits for data, on a CPU.
 
-Cost: 111 minutes in the recorded run on one core of a busy machine, most of it the 200 kills; `--scale smoke` about
-a minute and a half.
+Cost: 111 minutes in the recorded run on one core of a busy machine, most of it the 200 kills; `--scale smoke` eight
+minutes of one core where nothing is compiled yet.
 
 Expected: no difference in any bit; no wrong result; for every bad input an error that names the place and the fix;
 waits below 2 % of a step.
