@@ -242,7 +242,7 @@ def read_run(directory: Path) -> PastRun:
         results=_object(results, "verdict") if results.exists() else None,
         in_use=_in_use(directory),
     )
-    with fitting(times):
+    with fitting(times):  # what `list` shows is made once here, so that a file of another shape is named at once
         _ = run.summary
     with fitting(results):
         " ".join(run.outcome)

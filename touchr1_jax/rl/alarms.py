@@ -68,7 +68,7 @@ class AlarmRule:
         return Alarm(code=self.code, meaning=self.meaning, value=value, bound=self.bound)
 
 
-def middle_excess(now: Metrics, start: Metrics) -> float | None:
+def middle_excess(now: Metrics, start: Metrics) -> float:
     """F1: share of middle answers above the share of middle labels, whatever the number of levels."""
     del start
     return now["middle_rate"] - now["middle_labels"]

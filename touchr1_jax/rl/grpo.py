@@ -218,10 +218,13 @@ class GRPOEngine:
             rows = dynamic_sampling_rows(self.no_signal(group), self.config.prompts)
             group = jax.tree.map(lambda x: x[rows], group)
         reference = frozen.reference if state.reference is None else state.reference
-        group = self.penalised(group, sampler, reference) if self.config.algorithm.kl_in_reward else group
+        passed = functools.partial(log_probs, self.fns, self.config, batch=group.batch, rollout=group.rollout)
+        lagged, in_reward = not ratio_to_learner(self.config.algorithm), self.config.algorithm.kl_in_reward
+        rounds_otherwise = self.config.bfloat16 or group.batch.rollout is not None
+        own = passed(sampler) if lagged or (in_reward and rounds_otherwise) else group.rollout.log_prob
+        group = self.penalised(group, own - passed(reference)) if in_reward else group
         learn = self.experience(group, self.perturbed(group.batch, frozen, mask_key))
-        if not ratio_to_learner(self.config.algorithm):  # by the learner's pass: the sampler's own may round otherwise
-            learn = learn._replace(old=log_probs(self.fns, self.config, sampler, group.batch, learn.rollout))
+        learn = learn._replace(old=own) if lagged else learn
         params, opt_state, parts = update_policy(
             self.fns, self.optimizer, self.config, state.params, state.opt_state, reference, learn
         )
@@ -286,17 +289,13 @@ class GRPOEngine:
             equal &= zero_variance(group.bonus)
         return equal | ~group.finite
 
-    def penalised(self, group: Group, sampler: Params, reference: Params) -> Group:
+    def penalised(self, group: Group, log_ratio: Float[Array, "P G T"]) -> Group:
         """The group with −β Σ_t log(π/π_ref) as a further term of its reward: the unbiased estimate k1 of the KL.
 
-        Both are of the learner's pass where the sampler rounds otherwise: σ would make an advantage of the difference
-        among equal answers.  Groups that are left out, also for this term, again have the mean of all others.
+        `log_ratio` is of one pass where the sampler rounds otherwise: σ would make an advantage of the difference among
+        equal answers.  Groups that are left out, also for this term, again have the mean of all others.
         """
-        rollout, own = group.rollout, group.rollout.log_prob
-        passed = functools.partial(log_probs, self.fns, self.config, batch=group.batch, rollout=rollout)
-        if self.config.bfloat16 or group.batch.rollout is not None:
-            own = passed(sampler)
-        term = -self.config.algorithm.beta * masked.total(own - passed(reference), rollout.mask, -1)
+        term = -self.config.algorithm.beta * masked.total(log_ratio, group.rollout.mask, -1)
         finite = group.finite & jnp.all(jnp.isfinite(term), -1)
         neutral = functools.partial(neutralised, finite=finite)
         reward, terms = jax.tree.map(neutral, (group.reward + term, {**group.terms, "kl": term}))
