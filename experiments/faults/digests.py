@@ -14,6 +14,8 @@ import orbax.checkpoint as ocp
 
 from experiments.core.artifacts import read_json
 
+STATE = "state of "  # begins the name of the digest of a stage's checkpoints
+
 
 def digests(directory: Path) -> dict[str, str]:
     """SHA-256 of log lines, answers, results, and the checkpoints that every stage kept."""
@@ -27,7 +29,7 @@ def digests(directory: Path) -> dict[str, str]:
         # a kill during the deletion of an old checkpoint leaves a part of it, which no later session reads
         whole = (path for path in stage.iterdir() if path.name.isdigit() and (path / "data" / "metadata").exists())
         kept = sorted(whole, key=lambda path: int(path.name))
-        found[f"state of {stage.relative_to(checkpoints)}"] = _hash("".join(map(_state_hash, kept)).encode())
+        found[f"{STATE}{stage.relative_to(checkpoints)}"] = _hash("".join(map(_state_hash, kept)).encode())
     return found
 
 

@@ -95,7 +95,7 @@ def go_on_flipped(
         for path in (home / PRINTED, *home.rglob("results.json")):
             path.unlink(missing_ok=True)
         damaged = {home / one.path: (home / one.path).read_bytes() for one in group}
-        code, output = Session(training, home, programs).end()
+        code, output = Session(training, home, home / "cache", programs).end()
         left = {path for path, content in damaged.items() if path.exists() and path.read_bytes() == content}
         for one in group:  # a checkpoint of a stage that is done is not looked into, and would be refused if it were
             if home / one.path in left:

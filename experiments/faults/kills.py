@@ -118,13 +118,13 @@ class RunSize(NamedTuple):
 class Session:
     """One session of a training, from its start."""
 
-    def __init__(self, training: KillableTraining, home: Path, programs: Path) -> None:
+    def __init__(self, training: KillableTraining, home: Path, cache: Path, programs: Path) -> None:
         self._runs, self._steps, self._printed = home / training.name, training.steps, home / PRINTED
         home.mkdir(parents=True, exist_ok=True)
         self._directory: Path | None = None
         self._least = self._size()
         self._began, self._began_ns = time.monotonic(), time.time_ns()
-        folders = ["--runs-dir", str(home), "--cache-dir", str(home / "cache")]
+        folders = ["--runs-dir", str(home), "--cache-dir", str(cache)]
         arguments = [training.name, *training.options, *folders]
         target = (arguments, str(self._printed), str(programs))
         self._process: BaseProcess = _SERVER.Process(target=_session, args=target, daemon=True)
@@ -260,10 +260,11 @@ class KillSchedule:
 
 
 class UndisturbedRun(NamedTuple):
-    """A run without kills: its digests, lines of its log, seconds from its first line to its end."""
+    """A run without kills: its digests, lines of its log, seconds to its first line and from there to its end."""
 
     digests: Mapping[str, str]
     lines: int
+    startup_s: float
     work_s: float
 
 
@@ -285,7 +286,7 @@ class Campaign:
         began_s = session.age_s
         session.finish()
         directory = self.directory(UNDISTURBED)
-        return UndisturbedRun(digests(directory), log_state(directory).lines, session.age_s - began_s)
+        return UndisturbedRun(digests(directory), log_state(directory).lines, began_s, session.age_s - began_s)
 
     def run_killed(
         self,
@@ -319,10 +320,33 @@ class Campaign:
         """The home of a run that was killed once it had logged a share of the undisturbed one's lines."""
         shutil.rmtree(self.home / name, ignore_errors=True)
         session = self._session(name)
-        while session.log_state().lines < share * undisturbed.lines and session.sleep_until(session.age_s + POLL_S):
-            pass
+        self._wait_for_lines(session, share * undisturbed.lines)
         session.kill(undisturbed.lines)
         return self.home / name
+
+    def run_two(self, name: str, undisturbed: UndisturbedRun, moment: float) -> tuple[Path, Path, Kill | None]:
+        """Two runs that begin together on one empty cache; the first is killed once and continued.
+
+        The kill strikes at a share `moment` of the undisturbed run: of its start-up, in which it makes the records, and
+        its lines.  Returns the two directories and the kill, `None` if the first run ended before.
+        """
+        one, other = f"{name}-killed", f"{name}-other"
+        for home in (one, other):
+            shutil.rmtree(self.home / home, ignore_errors=True)
+        cache = self.home / one / "cache"
+        killed, second = (Session(self._training, self.home / home, cache, self.programs) for home in (one, other))
+        total_s = undisturbed.startup_s + undisturbed.work_s
+        lines = (moment * total_s - undisturbed.startup_s) / undisturbed.work_s * undisturbed.lines
+        if lines <= 0:
+            killed.sleep_until(moment * total_s)
+        else:
+            self._wait_for_lines(killed, lines)
+        kill = killed.kill(undisturbed.lines)
+        if kill is not None:
+            killed = Session(self._training, self.home / one, cache, self.programs)
+        for session in (killed, second):
+            session.finish()
+        return self.directory(one), self.directory(other), kill
 
     def directory(self, name: str) -> Path:
         """The one run directory of that name."""
@@ -335,7 +359,12 @@ class Campaign:
             own.mkdir(parents=True)
             for records in sorted((self.home / UNDISTURBED / "cache").glob("scenes-*")):
                 shutil.copytree(records, own / records.name)
-        return Session(self._training, self.home / name, self.programs)
+        return Session(self._training, self.home / name, own, self.programs)
+
+    def _wait_for_lines(self, session: Session, lines: float) -> None:
+        """Sleep until a session's run has logged so many lines, or the session has ended."""
+        while session.log_state().lines < lines and session.sleep_until(session.age_s + POLL_S):
+            pass
 
     def _wait(
         self, session: Session, lines: int, number: int, left: int, schedule: KillSchedule, reached: float

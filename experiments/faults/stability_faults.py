@@ -4,7 +4,8 @@
 
 Kills: `kill -9` ends training at random moments, a quarter of them during start-up, and the run is continued until it
 is finished; it is compared bit by bit with an undisturbed one.  The GRPO of a study is killed 200 times, a complete
-study a few times; their networks are so small that the loop takes most of the time of a step.  Damage: every file of an
+study a few times, and once each of several studies that share an empty cache with another one; their networks are so
+small that the loop takes most of the time of a step.  Damage: every file of an
 unfinished run, in four ways, and single bits in all files of a study and its cache.  Bad input: about forty kinds
 through the public command lines.  Waiting: the share of a step that waits for data, on a CPU.
 
@@ -33,7 +34,7 @@ from experiments.core.runner import Experiment
 from experiments.encoder.pretrain import pretrain
 from experiments.faults.bad_inputs import cases, provoke
 from experiments.faults.damaged_files import OUTCOMES, WRONG, Damage, damage_each
-from experiments.faults.digests import differences, digests
+from experiments.faults.digests import STATE, differences, digests
 from experiments.faults.fixtures import unfinished_run
 from experiments.faults.flipped_bits import RAW, READINGS, Flip, flip_bits, go_on_flipped
 from experiments.faults.flipped_bits import WRONG as WRONG_READING
@@ -85,6 +86,7 @@ class FaultsConfig:
     grpo_steps: int = 2000
     study: KillConfig = KillConfig(kills=10, startup_share=0.2)
     study_scale: str = "default"
+    shared: int = 9  # moments at which one of two studies that begin together on an empty cache is killed
     damaged_files: int | None = None
     flips: int = 1000
     """Bits flipped in the files of an unfinished and a finished study and their caches, of which each is read."""
@@ -113,6 +115,7 @@ def run(config: FaultsConfig, context: Context) -> Results:
     killed = {
         GRPO: kill_training(GRPO, grpo, config.grpo, context),
         "study": kill_training("study", whole, config.study, context),
+        "studies that share a cache": kill_one_of_two(whole, config, context),
     }
     with tempfile.TemporaryDirectory(prefix="touchr1-faults-") as scratch:
         home = Path(scratch)
@@ -149,6 +152,32 @@ def start_campaign(training: KillableTraining, config: KillConfig, context: Cont
     campaign = Campaign(home, programs, training, config)
     alone = context.once(f"kill/{training.name}/{UNDISTURBED}", lambda: campaign.run_undisturbed()._asdict())
     return campaign, UndisturbedRun(**alone)
+
+
+def kill_one_of_two(training: KillableTraining, config: FaultsConfig, context: Context) -> KilledRuns:
+    """Pairs of runs on one cache, of which one is killed; both count."""
+    campaign, undisturbed = start_campaign(training, config.study, context)
+    kills: list[Kill] = []
+    differs: list[str] = []
+    for i in context.each("killing one of two studies", range(config.shared), still=True):
+        stage = f"kill/{training.name}/shared-{i}"
+        if not context.done(stage):
+            *directories, kill = campaign.run_two(f"shared-{i}", undisturbed, (i + 0.5) / config.shared)
+            found = shared_differences([differences(undisturbed.digests, digests(each)) for each in directories])
+            context.save_stage(stage, {"kills": [] if kill is None else [kill], "differs": found})
+        kept = context.load_stage(stage)
+        kills += [Kill(**kill) for kill in kept["kills"]]
+        differs += [f"pair {i}: {what}" for what in kept["differs"]]
+    return KilledRuns(kills=tuple(kills), runs=2 * config.shared, differs=tuple(differs))
+
+
+def shared_differences(found: Sequence[Sequence[str]]) -> list[str]:
+    """Differences of runs on one cache: all of logs, answers and results, and of states those that all runs have.
+
+    A policy that one run trained is read from the cache by the others, which then lack its states.
+    """
+    in_all = set.intersection(*map(set, found))
+    return [what for names in found for what in names if what in in_all or not what.startswith(STATE)]
 
 
 def _strike(
@@ -363,7 +392,7 @@ def kill_picture(killed: Mapping[str, KilledRuns]) -> Picture:
 
 DEFAULT = FaultsConfig()
 SMOKE = FaultsConfig(
-    grpo=KillConfig(kills=3), grpo_steps=20, study=KillConfig(kills=1), study_scale="short",
+    grpo=KillConfig(kills=3), grpo_steps=20, study=KillConfig(kills=1), study_scale="short", shared=1,
     damaged_files=2, flips=100, resumed_flips=2, bad_inputs=30, waiting=WaitingConfig(steps=3),
 )  # fmt: skip
 

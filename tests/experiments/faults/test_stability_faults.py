@@ -11,7 +11,15 @@ from experiments.faults.damaged_files import OLDER, OUTCOMES, SAME, WRONG, Damag
 from experiments.faults.fixtures import unfinished_run
 from experiments.faults.flipped_bits import FOUND, RAW, Flip
 from experiments.faults.kills import START, STEPPING, Kill
-from experiments.faults.stability_faults import GRPO, KilledRuns, WaitingConfig, damage_table, kill_table, report
+from experiments.faults.stability_faults import (
+    GRPO,
+    KilledRuns,
+    WaitingConfig,
+    damage_table,
+    kill_table,
+    report,
+    shared_differences,
+)
 from sensors_io.index import TABLES
 from tests.experiments import tiny
 from tests.experiments.encoder.test_pretrain import PRETRAIN
@@ -54,6 +62,12 @@ def test_kills_and_damage_are_counted():
     other = dataclasses.replace(DAMAGE, file="x", outcome=OLDER)
     by_kind = [dict(zip(OUTCOMES, row[1:], strict=False)) for row in damage_table([DAMAGE, DAMAGE, other]).rows]
     assert [(row[SAME], row[OLDER]) for row in by_kind] == [(2, 0), (0, 1)]
+
+
+def test_runs_on_one_cache_may_lack_the_states_that_another_has():
+    assert shared_differences([("state of sft/0",), ()]) == []
+    assert shared_differences([("state of sft/0",), ("state of sft/0",)]) == ["state of sft/0"] * 2
+    assert shared_differences([(), ("metrics.jsonl",)]) == ["metrics.jsonl"]
 
 
 def test_a_save_that_was_cut_off_is_of_no_kind_that_is_read(tmp_path, context):
