@@ -24,7 +24,10 @@ def zero_variance(reward: Float[Array, "*p G"]) -> Bool[Array, "*p"]:
 def no_signal(
     algorithm: Algorithm, reward: Float[Array, "P G"], terms: Mapping[str, Float[Array, "P G"]]
 ) -> Bool[Array, "P"]:
-    """Groups in which every advantage is 0 for any σ, because the compared rewards are all equal."""
+    """Groups in which every advantage is 0 for any σ, because the compared rewards are all equal.
+
+    Under GLOBAL that is so if those of the whole batch are: a group of equal rewards differs from other groups.
+    """
     over_batch = lambda x: jnp.broadcast_to(zero_variance(x.reshape(-1)), x.shape[:1])
     equal = over_batch if algorithm.advantage is Advantage.GLOBAL else zero_variance
     if algorithm.segment_credit or algorithm.advantage is Advantage.PER_REWARD:
@@ -104,7 +107,8 @@ def advantages(
             total = sum(
                 (group_advantage(term, epsilon=epsilon) for term in terms.values()), start=jnp.zeros_like(reward)
             )
-            return total / (jnp.std(total) + epsilon)
+            sigma = jnp.std(total) + epsilon
+            return total / jnp.where(sigma > 0, sigma, 1.0)
         case _:
             assert_never(algorithm.advantage)
 

@@ -86,6 +86,9 @@ class SampleConfig:
     def __post_init__(self) -> None:
         above(self, 0, "temperature", "top_p")
         within(self, 0, 1, "top_p", "min_p")
+        if self.constraint is not None and self.length < self.constraint.shortest:
+            least = f"must be at least {self.constraint.shortest}, the shortest formatted answer with its end"
+            raise ValueError(f"length is {self.length}: {least}; raise it, or sample without constraint")
 
 
 def encode_prompts(

@@ -113,6 +113,10 @@ def test_rewards_whose_spread_overflows_are_named_too():
     _, _, finite, shares = left_out_groups(big, {"a": big})
     np.testing.assert_array_equal(finite, [False, True])
     assert (shares["nonfinite_in_a"], shares["nonfinite_in_total"]) == (0, 0.5)
+    # those of each group are finite, of the batch not; those of the sum are, of its parts not
+    many, parts = jnp.full((4, 2), 1e19), {"a": big, "b": 1 - big}
+    assert not left_out_groups(many, {"a": many})[2].any()
+    np.testing.assert_array_equal(left_out_groups(jnp.ones((2, 2)), parts)[2], [False, True])
 
 
 PARAMS = {"w": jnp.arange(3.0)}
