@@ -314,7 +314,7 @@ class GRPOEngine:
         advantage, by_token = kept(advantages(algorithm, group.reward, group.terms, group.finite)), None
         if isinstance(self.score, WeightedScore) and algorithm.segment_credit:
             tokens = group.rollout.tokens
-            by_token = kept(self.score.segment_advantages(algorithm, group.reward, group.terms, tokens))
+            by_token = kept(self.score.segment_advantages(algorithm, group.reward, group.terms, tokens, group.finite))
         if algorithm.tactile_use is TactileUse.RECOMMENDED:
             bonus = jnp.where(group.finite[:, None], added_after(group.bonus, algorithm.tactile_weight), 0.0)
             advantage, by_token = advantage + bonus, by_token if by_token is None else by_token + bonus[..., None]

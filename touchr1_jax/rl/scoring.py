@@ -94,6 +94,7 @@ class WeightedScore:
         reward: Float[Array, "P G"],
         terms: Mapping[str, Float[Array, "P G"]],
         tokens: Int[Array, "P G T"],
+        finite: Bool[Array, "P"],
     ) -> Float[Array, "P G T"]:
         """`advantages.segment_advantages` of rollouts.
 
@@ -104,7 +105,7 @@ class WeightedScore:
             raise ValueError(f"parser is {self.parser!r}: must be a text.parser.Parser to tell segments; use one")
         settled = {n: SEGMENTS.index(r.settled) for n, r in self.rewards.items() if isinstance(r, Reward)}
         segment = jax.vmap(jax.vmap(self.parser.segments))(tokens)
-        return segment_advantages(algorithm, reward, terms, settled, segment)
+        return segment_advantages(algorithm, reward, terms, settled, segment, finite)
 
 
 def left_out_groups(
