@@ -81,7 +81,7 @@ def echo_excess(now: Metrics, start: Metrics) -> float | None:
     either direction, agree with probability a² + (1 − a)²/2, which is at most a for every a from ⅓ to 1.
     """
     del start
-    return now["echo_share"] - now["echo_right"]
+    return now["echo_share"] - now["echo_right"] if "echo_right" in now else None  # no line of older logs has it
 
 
 def grounding_size(now: Metrics, start: Metrics) -> float | None:

@@ -158,7 +158,7 @@ class Algorithm:
         literal = self.tactile_use is TactileUse.LITERAL
         if self.advantage is Advantage.PER_REWARD and (literal or self.kl_in_reward):
             field, weight = ("tactile_use", "tactile_weight") if literal else ("kl_in_reward", "beta")
-            raise ValueError(f"{field} is on: must be off for PER_REWARD, whose σ takes {weight} away; change either")
+            raise ValueError(f"{field} is {getattr(self, field)}: must go for PER_REWARD, whose σ takes {weight} away")
         if self.segment_credit and self.surrogate is Surrogate.SEQUENCE:  # its gradient is that of the credits' mean
             raise ValueError("segment_credit is True: must be False for surrogate SEQUENCE, one ratio; change either")
         idle = ("learn_conclusion", "enumerated"), ("importance_sequence", "importance_cap"), ("kl_in_reward", "beta")

@@ -96,12 +96,6 @@ def test_segments_are_credited_only_where_a_token_has_a_credit_of_its_own():
         ({"tactile_margin": -0.1}, "tactile_margin is -0.1: must be ≥ 0"),
         ({"tactile_margin": float("nan")}, "tactile_margin is nan: must be ≥ 0"),
         ({"grounding_cap_nat": 0.0}, "grounding_cap_nat is 0.0: must be above 0; None leaves it out"),
-        ({"kl_in_reward": True, "beta": 0.0}, "kl_in_reward is True, but beta is 0.0: set it or drop kl_in_reward"),
-        ({"kl_in_reward": True, "advantage": Advantage.PER_REWARD}, "kl_in_reward is on: must be off for PER_REWARD"),
-        (
-            {"tactile_use": TactileUse.LITERAL, "advantage": Advantage.PER_REWARD},
-            "tactile_use is on: must be off for PER_REWARD, whose σ takes tactile_weight away",
-        ),
     ],
 )
 def test_bad_settings_are_named(change, message):
