@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from touchr1_jax.models.chunked_logits import MAX_LOGITS
+from touchr1_jax.models.layers import TEMPERATURES
 from touchr1_jax.types import Params
 from touchr1_jax.validation import above, at_least, within
 
@@ -346,15 +347,13 @@ class GRPOConfig:
 
     def __post_init__(self) -> None:
         at_least(self, 1, "prompts", "group", "length", "micro_prompts", "max_logits")
-        at_least(self, 0, "learning_rate", "lr_scale", "temperature")
-        above(self, 0, "max_grad_norm", "temperature", "top_p")
+        at_least(self, 0, "learning_rate", "lr_scale")
+        above(self, 0, "max_grad_norm", "top_p")
         within(self, 0, 1, "final_share", "top_p", "min_p")
-        if self.prompts % (self.micro_prompts * self.algorithm.minibatches):
-            parts = f"{self.algorithm.minibatches} minibatches" if self.algorithm.minibatches > 1 else ""
-            raise ValueError(
-                f"micro_prompts {self.micro_prompts}{parts and ' of each of '}{parts} must divide prompts "
-                f"{self.prompts}; choose a divisor of it"
-            )
+        within(self, *TEMPERATURES, "temperature")
+        if self.prompts % (self.micro_prompts * (parts := self.algorithm.minibatches)):
+            micro = f"{self.micro_prompts} of each of {parts} minibatches" if parts > 1 else f"{self.micro_prompts}"
+            raise ValueError(f"micro_prompts {micro} must divide prompts {self.prompts}; choose a divisor of it")
         if self.group < 2 and (self.algorithm.advantage, self.algorithm.enumerated) != (Advantage.GLOBAL, None):
             needs = "must be at least 2, but for advantage GLOBAL without enumerated: rollouts are compared; raise it"
             raise ValueError(f"group is {self.group}: {needs}")

@@ -403,6 +403,7 @@ def test_bad_options_are_named(change, message):
     ("change", "message"),
     [
         ({"temperature": 0.0}, "temperature is 0.0"),
+        ({"temperature": 1e8}, "temperature is 100000000.0: must lie in 1e-06 … 1000000.0"),  # would draw banned tokens
         ({"top_p": 0.0}, "top_p is 0.0"),
         ({"min_p": 1.5}, "min_p is 1.5"),
         ({"group": 1, "algorithm": ReinforcePlusPlus(enumerated=Norm.NONE)}, "group is 1: must be at least 2"),
