@@ -326,7 +326,7 @@ def scores(scene: WorldBatch, parsed: Parsed) -> dict[str, Array]:
     asked = jnp.broadcast_to(target.asked[:, None], parsed.conclude.shape)
     answer = jnp.sum(jnp.where(asked, parsed.conclude, 0), -1)
     slots = jnp.sum(jnp.where(asked[..., None, :], parsed.perceive, 0), -1)
-    metrics = answer_metrics(parsed, target)
+    metrics = answer_metrics(parsed, target, levels=0)
     return {
         "accuracy": jnp.mean(answer == scene.level[:, None]),
         "middle": jnp.mean(answer == (K - 1) // 2),

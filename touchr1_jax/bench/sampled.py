@@ -97,7 +97,10 @@ def majority(sampled: np.ndarray, label: np.ndarray) -> Votes:
 
 
 def reliability(votes: Votes, bins: int = 10) -> tuple[Bin, ...]:
-    """Bins of equal width in confidence, without the empty ones; a calibrated policy has `confidence` = `right`."""
+    """Bins of equal width in confidence, without the empty ones; a calibrated policy has `confidence` = `right`.
+
+    A bin holds its lower end, the last one both; in the source of `calibration_error` a bin holds its upper end.
+    """
     place = np.minimum((votes.confidence * bins).astype(int), bins - 1)
     found = [place == b for b in np.unique(place)]
     return tuple(Bin(float(votes.confidence[at].mean()), float(votes.right[at].mean()), int(at.sum())) for at in found)

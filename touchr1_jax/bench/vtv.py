@@ -85,10 +85,12 @@ def draw_tasks(label: Int[np.ndarray, "n A"], count: int, seed: int) -> VTVTasks
     `count` is a multiple of 24, so that orders, rotations, assignments and attributes come equally often.
 
     Raises:
-      ValueError: another count; a level that no recording has; recordings that are all alike.
+      ValueError: another count; an unknown level, or one that no recording has; recordings that are all alike.
     """
     if count < 1 or count % 24:
         raise ValueError(f"count is {count}: must be a positive multiple of 24, all orders of four attributes; change")
+    if unknown := np.flatnonzero(np.any(label < 0, axis=1)).tolist():
+        raise ValueError(f"label[{unknown[0]}] is {label[unknown[0]].tolist()}: must be ≥ 0; leave unlabelled ones out")
     for a, name in enumerate(ATTRIBUTES):
         missing = sorted(set(range(LEVELS)) - set(label[:, a].tolist()))
         if missing:

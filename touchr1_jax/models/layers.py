@@ -17,6 +17,9 @@ from touchr1_jax.models.vmappable_dense import Dense
 MASKED = -1e9
 """Score of a forbidden key or token: finite, so that 0 · MASKED is 0 and no NaN arises from differences."""
 
+TEMPERATURES = 1e-6, 1e6
+"""Range of a divisor of logits in which `MASKED` stays finite and out of reach."""
+
 MOST_LAYERS = 1000
 """Ten times as many as large models have; each is traced by itself, so that more would seem to hang."""
 

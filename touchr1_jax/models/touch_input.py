@@ -10,6 +10,9 @@ import numpy as np
 from touchr1_jax.models.saved_policy import SavedPolicy
 from touchr1_jax.text.plain_questions import QuestionError
 
+LAST_INDEX = 2**24
+"""Largest position of a frame: rotary angles are float32, which has no odd numbers beyond, and positions add up."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class TouchInput:
@@ -99,10 +102,10 @@ def _checked(touch: TouchInput, sensor: str, most: int) -> tuple[np.ndarray, np.
             f"({n}, 3) and ({n},) for {n} frames; align them"
         )
     measured = force.dtype.kind in "iuf" and (np.abs(force) <= np.finfo(np.float32).max).all()  # false of NaN
-    if not measured or index.dtype.kind not in "iu" or index.min() < 0 or index.max() > np.iinfo(np.int32).max:
+    if not measured or index.dtype.kind not in "iu" or index.min() < 0 or index.max() > LAST_INDEX:
         raise QuestionError(
-            f"force_n[{sensor}] and index[{sensor}] must be finite numbers (float32) and whole numbers ≥ 0 (int32); "
-            "leave a force out that was not measured"
+            f"force_n[{sensor}] and index[{sensor}] must be finite numbers (float32) and whole numbers from 0 to "
+            f"{LAST_INDEX}; leave a force out that was not measured, count frames from the first one"
         )
     if not (index[1:] > index[:-1]).all():
         raise QuestionError(f"index[{sensor}] is {index}: must increase with time; sort the frames, each once")

@@ -24,7 +24,10 @@ def zero_variance(reward: Float[Array, "*p G"]) -> Bool[Array, "*p"]:
 def no_signal(
     algorithm: Algorithm, reward: Float[Array, "P G"], terms: Mapping[str, Float[Array, "P G"]]
 ) -> Bool[Array, "P"]:
-    """Groups in which every advantage is 0 for any σ, because the compared rewards are all equal."""
+    """Groups in which every advantage is 0 for any σ, because the compared rewards are all equal.
+
+    Under GLOBAL that is so if those of the whole batch are: a group of equal rewards differs from other groups.
+    """
     over_batch = lambda x: jnp.broadcast_to(zero_variance(x.reshape(-1)), x.shape[:1])
     equal = over_batch if algorithm.advantage is Advantage.GLOBAL else zero_variance
     if algorithm.segment_credit or algorithm.advantage is Advantage.PER_REWARD:
@@ -86,6 +89,7 @@ def advantages(
       finite: groups that stay, for `of_kept_groups`; all by default.
     """
     epsilon, reward = algorithm.epsilon, best_of(reward, algorithm.best_of)
+    of_batch = epsilon if finite is None else epsilon * jnp.sqrt(jnp.mean(finite.astype(jnp.float32)))
     if finite is not None and algorithm.best_of > 1:  # the best of k has another mean over the batch than the reward
         reward = neutralised(reward, finite)
     match algorithm.advantage:
@@ -99,12 +103,13 @@ def advantages(
             others = reward.shape[-1] - 1
             return group_advantage(reward, epsilon=epsilon, normalise=False) * ((others + 1) / others)
         case Advantage.GLOBAL:
-            return group_advantage(reward.reshape(-1), epsilon=epsilon).reshape(reward.shape)
+            return group_advantage(reward.reshape(-1), epsilon=of_batch).reshape(reward.shape)
         case Advantage.PER_REWARD:
             total = sum(
                 (group_advantage(term, epsilon=epsilon) for term in terms.values()), start=jnp.zeros_like(reward)
             )
-            return total / (jnp.std(total) + epsilon)
+            sigma = jnp.std(total) + of_batch
+            return total / jnp.where(sigma > 0, sigma, 1.0)
         case _:
             assert_never(algorithm.advantage)
 
@@ -115,7 +120,7 @@ def of_kept_groups(
     """Advantages as if the excluded groups did not exist; those of excluded groups become 0.
 
     The reward of an excluded group is the mean of all others (`scoring.left_out_groups`).  It does not change the mean
-    of the batch and multiplies σ of the batch by the square root of the share of groups that stay.
+    of the batch and multiplies σ of the batch, and ε in `advantages`, by the root of the share of groups that stay.
     """
     of_batch = algorithm.advantage in (Advantage.GLOBAL, Advantage.PER_REWARD)
     scale = jnp.sqrt(jnp.mean(finite.astype(jnp.float32))) if of_batch else 1.0
@@ -128,6 +133,7 @@ def segment_advantages(
     terms: Mapping[str, Float[Array, "P G"]],
     settled: Mapping[str, int],
     segment: Int[Array, "P G T"],
+    finite: Bool[Array, "P"] | None = None,
 ) -> Float[Array, "P G T"]:
     """Advantage of each token from the rewards that are not known before its segment: the return from there on.
 
@@ -137,20 +143,20 @@ def segment_advantages(
     separately.
 
     Args:
-      algorithm, reward, terms: as for `advantages`.
+      algorithm, reward, terms, finite: as for `advantages`.
       settled: number of the segment at whose end a term is known; without one, the last.
       segment: number of each token's segment: 0 up to the end of `perceive`, 1 up to that of `compare`, then 2.
     """
     left, rest, each = reward, dict(terms), []
     for s in range(3):
-        each.append(advantages(algorithm, left, rest))
+        each.append(advantages(algorithm, left, rest, finite))
         for name in [name for name in rest if settled.get(name, 2) == s]:
             left = left - rest.pop(name)
     return jnp.take_along_axis(jnp.stack(each, -1), segment, -1)
 
 
 def group_advantage(
-    reward: Float[Array, "*p G"], *, epsilon: float = 1e-4, normalise: bool = True
+    reward: Float[Array, "*p G"], *, epsilon: float | Float[Array, ""] = 1e-4, normalise: bool = True
 ) -> Float[Array, "*p G"]:
     """Advantage within a group, A_i = (R_i − R̄)/(σ_R + ε), population σ (DeepSeekMath, arXiv 2402.03300, eq. 4).
 

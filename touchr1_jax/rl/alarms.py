@@ -75,13 +75,13 @@ def middle_excess(now: Metrics, start: Metrics) -> float:
 
 
 def echo_excess(now: Metrics, start: Metrics) -> float | None:
-    """F2: share of answers whose slots all agree, less the share of right answers.
+    """F2: share of formatted answers whose slots all agree, less the share of right ones among them.
 
     For honest slots it is at most 0: two independent slots, each right with probability a and otherwise wrong in
     either direction, agree with probability a² + (1 − a)²/2, which is at most a for every a from ⅓ to 1.
     """
     del start
-    return now["echo_share"] - now["accuracy"]
+    return now["echo_share"] - now["echo_right"] if "echo_right" in now else None  # no line of older logs has it
 
 
 def grounding_size(now: Metrics, start: Metrics) -> float | None:
@@ -163,9 +163,12 @@ def touched_share(now: Metrics, start: Metrics) -> float | None:
 
 
 def left_out_groups(now: Metrics, start: Metrics) -> float | None:
-    """F15: share of the groups that are left out because a reward is not finite."""
+    """F15: share of the groups that are left out because a reward is not finite.
+
+    Of all candidates, or of the selected groups if it is larger there: a KL in the reward is known for these alone.
+    """
     del start
-    return now.get("drawn_nonfinite_share", now.get("nonfinite_share"))
+    return max((now[name] for name in ("drawn_nonfinite_share", "nonfinite_share") if name in now), default=None)
 
 
 def left_out_updates(now: Metrics, start: Metrics) -> float | None:

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from touchr1_jax.models.chunked_logits import MAX_LOGITS
+from touchr1_jax.models.layers import TEMPERATURES
 from touchr1_jax.types import Params
 from touchr1_jax.validation import above, at_least, within
 
@@ -91,7 +92,7 @@ class Algorithm:
     best_of: int = 1
     """Compare rewards by the best of k rollouts, pass@k or max@k (see `best_of`); 1 compares single rollouts."""
     enumerated: Norm | None = None
-    """Enumerate the concluding level, with rewards divided by this norm; `None` samples it (see `enumerated`)."""
+    """Enumerate the concluding level, compared by this norm, not `advantage` (see `enumerated`); `None` samples it."""
     learn_conclusion: bool = True
     """Learn the concluding level; False needs `enumerated`, and the level follows the reference (KL, weight 1)."""
     segment_credit: bool = False
@@ -103,7 +104,7 @@ class Algorithm:
     drop_degenerate: bool = False
     """Leave groups of equal rewards out of the policy-gradient mean; KL and G_tg keep all."""
     candidates: int = 1
-    """Prompts sampled for each prompt of the update; groups of equal rewards are skipped."""
+    """Prompts sampled for each prompt of the update; groups without signal are skipped (see `advantages.no_signal`)."""
     mask_truncated: bool = False
     """Leave rollouts without an end token out of the loss; their rewards still count in the group."""
     constrained: bool = False
@@ -112,7 +113,7 @@ class Algorithm:
     """Weight of the KL to the reference."""
     kl: KLEstimator = "k3"
     kl_in_reward: bool = False
-    """Subtract β Σ_t log(π/π_ref) from a rollout's reward, not β KL from J; among equal answers, σ magnifies it."""
+    """Subtract β Σ_t log(π/π_ref), whatever `kl` is, from a reward, not β KL from J; as in verl, σ divides it too."""
     reference_every: int | None = None
     """Steps after which the policy becomes its own reference; `None` keeps the first reference."""
     reference_share: float = 1.0
@@ -155,14 +156,17 @@ class Algorithm:
             if getattr(self, field) != value:
                 needs = f"must be {value} where enumerated is set, because it needs a sampled conclusion; change either"
                 raise ValueError(f"{field} is {getattr(self, field)}: {needs}")
-        if self.kl_in_reward and self.advantage is Advantage.PER_REWARD:
-            raise ValueError("kl_in_reward is True: must be False for PER_REWARD, whose σ takes beta away; change one")
+        literal = self.tactile_use is TactileUse.LITERAL
+        if self.advantage is Advantage.PER_REWARD and (literal or self.kl_in_reward):
+            field, weight = ("tactile_use", "tactile_weight") if literal else ("kl_in_reward", "beta")
+            raise ValueError(f"{field} is {getattr(self, field)}: must go for PER_REWARD, whose σ takes {weight} away")
         if self.segment_credit and self.surrogate is Surrogate.SEQUENCE:  # its gradient is that of the credits' mean
             raise ValueError("segment_credit is True: must be False for surrogate SEQUENCE, one ratio; change either")
-        idle = ("learn_conclusion", "enumerated"), ("importance_sequence", "importance_cap")
+        idle = ("learn_conclusion", "enumerated"), ("importance_sequence", "importance_cap"), ("kl_in_reward", "beta")
         for field, needed in (*idle, ("reference_share", "reference_every")):
-            if getattr(self, field) != getattr(type(self), field) and getattr(self, needed) is None:
-                raise ValueError(f"{field} is {getattr(self, field)}, but {needed} is None: set it or drop {field}")
+            value, need = getattr(self, field), getattr(self, needed)
+            if value != getattr(type(self), field) and (need is None or left_out(need)):
+                raise ValueError(f"{field} is {value}, but {needed} is {need}: set it or drop {field}")
         at_least(self, 0, "stale", "score_centering")
         if not 0 < self.reference_share <= 1:
             raise ValueError(f"reference_share is {self.reference_share}: must lie in 0 < share ≤ 1; 1 is no average")
@@ -343,20 +347,16 @@ class GRPOConfig:
 
     def __post_init__(self) -> None:
         at_least(self, 1, "prompts", "group", "length", "micro_prompts", "max_logits")
-        at_least(self, 0, "learning_rate", "lr_scale", "temperature")
-        above(self, 0, "max_grad_norm", "temperature", "top_p")
+        at_least(self, 0, "learning_rate", "lr_scale")
+        above(self, 0, "max_grad_norm", "top_p")
         within(self, 0, 1, "final_share", "top_p", "min_p")
-        if self.prompts % (self.micro_prompts * self.algorithm.minibatches):
-            parts = f"{self.algorithm.minibatches} minibatches" if self.algorithm.minibatches > 1 else ""
-            raise ValueError(
-                f"micro_prompts {self.micro_prompts}{parts and ' of each of '}{parts} must divide prompts "
-                f"{self.prompts}; choose a divisor of it"
-            )
+        within(self, *TEMPERATURES, "temperature")
+        if self.prompts % (self.micro_prompts * (parts := self.algorithm.minibatches)):
+            micro = f"{self.micro_prompts} of each of {parts} minibatches" if parts > 1 else f"{self.micro_prompts}"
+            raise ValueError(f"micro_prompts {micro} must divide prompts {self.prompts}; choose a divisor of it")
         if self.group < 2 and (self.algorithm.advantage, self.algorithm.enumerated) != (Advantage.GLOBAL, None):
-            raise ValueError(
-                f"group is {self.group}: must be at least 2: a rollout is compared with its group; raise it, or choose "
-                "advantage GLOBAL without enumerated"
-            )
+            needs = "must be at least 2, but for advantage GLOBAL without enumerated: rollouts are compared; raise it"
+            raise ValueError(f"group is {self.group}: {needs}")
         apart = self.algorithm.advantage is Advantage.PER_REWARD or self.algorithm.segment_credit
         if (best_of := self.algorithm.best_of) > 1 and (best_of > self.group or apart):
             raise ValueError(

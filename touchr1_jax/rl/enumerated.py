@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.rl.config import Norm
-from touchr1_jax.rl.scoring import NONFINITE_IN
+from touchr1_jax.rl.scoring import NONFINITE_IN, squares_fit
 from touchr1_jax.text.template import LevelTokens
 from touchr1_jax.types import Target
 
@@ -89,7 +89,7 @@ def level_rewards(
         return jnp.where((finite & (word >= 0))[:, None], reward, 0.0)
 
     reward = jnp.moveaxis(jax.lax.map(with_level, (jnp.arange(ids.shape[1]), ids.T)), 0, -1)
-    known = finite & jnp.all(jnp.isfinite(reward), (-2, -1))
+    known = finite & squares_fit(reward)
     found = LevelRewards(ids=ids, at=at, reward=jnp.where(known[:, None, None], reward, 0.0), sampled=sampled)
     return found, known, {f"{NONFINITE_IN}levels": jnp.mean(finite & ~known)}
 

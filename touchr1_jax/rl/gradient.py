@@ -133,7 +133,8 @@ def log_probs(
     fns: PolicyFns, config: GRPOConfig, params: Params, batch: GRPOBatch, rollout: Rollout
 ) -> Float[Array, "P G T"]:
     """Log-probabilities of the sampled tokens under some parameters."""
-    algorithm = dataclasses.replace(config.algorithm, beta=0.0, gamma=0.0, entropy_weight=0.0, anchor=0.0)
+    nothing: dict[str, Any] = {"beta": 0.0, "kl_in_reward": False, "gamma": 0.0, "entropy_weight": 0.0, "anchor": 0.0}
+    algorithm = dataclasses.replace(config.algorithm, **nothing)
     plain = dataclasses.replace(config, algorithm=algorithm)
     each = jnp.ones(rollout.mask.shape[:2])
     stream = jnp.zeros(len(each), jnp.int32)

@@ -53,7 +53,9 @@ from touchr1_jax.rl.scoring import (
     ScoreFn,
     WeightedScore,
     left_out_groups,
+    ordinal_levels,
     require_stable_rewards,
+    squares_fit,
 )
 from touchr1_jax.rl.update import update_policy
 from touchr1_jax.text.constraint import Constraint
@@ -296,7 +298,7 @@ class GRPOEngine:
         equal answers.  Groups that are left out, also for this term, again have the mean of all others.
         """
         term = -self.config.algorithm.beta * masked.total(log_ratio, group.rollout.mask, -1)
-        finite = group.finite & jnp.all(jnp.isfinite(term), -1)
+        finite = group.finite & squares_fit(term) & squares_fit(group.reward + term)
         neutral = functools.partial(neutralised, finite=finite)
         reward, terms = jax.tree.map(neutral, (group.reward + term, {**group.terms, "kl": term}))
         return group._replace(reward=reward, terms=terms, finite=finite)
@@ -312,7 +314,7 @@ class GRPOEngine:
         advantage, by_token = kept(advantages(algorithm, group.reward, group.terms, group.finite)), None
         if isinstance(self.score, WeightedScore) and algorithm.segment_credit:
             tokens = group.rollout.tokens
-            by_token = kept(self.score.segment_advantages(algorithm, group.reward, group.terms, tokens))
+            by_token = kept(self.score.segment_advantages(algorithm, group.reward, group.terms, tokens, group.finite))
         if algorithm.tactile_use is TactileUse.RECOMMENDED:
             bonus = jnp.where(group.finite[:, None], added_after(group.bonus, algorithm.tactile_weight), 0.0)
             advantage, by_token = advantage + bonus, by_token if by_token is None else by_token + bonus[..., None]
@@ -359,15 +361,15 @@ class GRPOEngine:
         right = jax.vmap(jax.vmap(tactile_use.right, in_axes=(0, None)))(group.parsed, target)
         return {
             **reward_metrics(group.terms, right, group.finite),
-            **rollout_metrics(group.rollout, group.reward, self.no_signal(group), group.parsed, target),
+            **rollout_metrics(group.rollout, group.reward, self.no_signal(group), group.finite, group.parsed, target),
         }
 
     def metrics(self, group: Group, learn: Experience) -> dict[str, Array]:
         """Metrics of the selected groups alone: their answers, advantages, bonuses and touch."""
         algorithm, reward = self.config.algorithm, group.reward
         return {
-            **answer_metrics(group.parsed, group.batch.target),
+            **answer_metrics(group.parsed, group.batch.target, ordinal_levels(self.score)),
             **advantage_metrics(reward, learn.advantage),
-            **tactile_use.bonus_metrics(algorithm, reward, group.terms, group.bonus, learn.advantage),
+            **tactile_use.bonus_metrics(algorithm, reward, group.terms, group.bonus, learn.advantage, group.finite),
             **touch_metrics(group.batch.features),
         }

@@ -124,7 +124,13 @@ class Episodes:
     def step(
         self, actions: Int[np.ndarray, "E"]
     ) -> tuple[Observation, Float[np.ndarray, "E"], Bool[np.ndarray, "E"], list[dict[str, Any]]]:
-        """Take an action in every episode: observations, rewards, which episodes end, and totals."""
+        """Take an action in every episode: observations, rewards, which episodes end, and totals.
+
+        Raises:
+          ValueError: an action that is no number 0 … `actions` − 1.
+        """
+        if np.any((actions < 0) | (actions >= self.actions)):
+            raise ValueError(f"actions are {actions}: must lie in 0 … {self.actions - 1}; correct the agent")
         used = (self._taken >= 0).sum(1)
         going = np.flatnonzero((actions < self._kinds) & (used < self._taken.shape[1]))
         self._state, outcome = jax.device_get(self._step(self._state, np.minimum(actions, self._kinds - 1)))

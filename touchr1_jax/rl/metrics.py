@@ -12,16 +12,24 @@ from touchr1_jax.types import Parsed, Rollout, Target
 
 
 def rollout_metrics(
-    rollout: Rollout, reward: Float[Array, "P G"], no_signal: Bool[Array, "P"], parsed: Parsed, target: Target
+    rollout: Rollout,
+    reward: Float[Array, "P G"],
+    no_signal: Bool[Array, "P"],
+    finite: Bool[Array, "P"],
+    parsed: Parsed,
+    target: Target,
 ) -> dict[str, Array]:
-    """Means over all rollouts; `middle_rate` and `middle_labels` over questions whose levels have a middle one."""
+    """Means over all rollouts; `middle_rate` and `middle_labels` over questions whose levels have a middle one.
+
+    `reward` and `reward_std` are of the groups that are not left out.
+    """
     asked = target.asked[:, None]
     label, middle = target.label[:, None], (target.levels[:, None] - 1) // 2
     has_middle = asked & (target.ordinal & (target.levels % 2 == 1))[:, None]
     right = (parsed.conclude == label) & (label >= 0)
     return {
-        "reward": jnp.mean(reward),
-        "reward_std": jnp.mean(jnp.std(reward, -1)),
+        "reward": masked.mean(reward, finite[:, None]),
+        "reward_std": masked.mean(jnp.std(reward, -1), finite),
         "degenerate_share": jnp.mean(no_signal),
         "accuracy": masked.mean(right, jnp.broadcast_to(asked, right.shape)),
         "middle_rate": masked.mean(parsed.conclude == middle, jnp.broadcast_to(has_middle, right.shape)),
@@ -32,29 +40,32 @@ def rollout_metrics(
     }
 
 
-def answer_metrics(parsed: Parsed, target: Target) -> dict[str, Array]:
+def answer_metrics(parsed: Parsed, target: Target, levels: int) -> dict[str, Array]:
     """Distribution of the answers: accuracy of each level, the most frequent answer, slots that repeat each other.
 
-    `right_level_k` is the share right of ordinal questions whose label is k = 0, 1 or 2, `labels_level_k` their number;
+    `right_level_k` is the share right of ordinal questions whose label is k, `labels_level_k` their number, for each
+    k < `levels`, the most levels of an ordinal attribute (0 leaves these out);
     `mode_share` the share of the most frequent level among ordinal answers, `label_mode_share` among their labels;
-    `echo_share` the share of formatted answers whose slots all name one level; `gamed_share` the share of answers that
-    name levels and are not formatted or name several in their conclusion.
+    `echo_share` the share of formatted ordinal answers whose slots all name one level, `echo_right` that of the right
+    ones among the same; `gamed_share` the share of answers that name levels and are not formatted or name several in
+    their conclusion.
     """
     asked = jnp.broadcast_to((target.asked & target.ordinal)[:, None], parsed.conclude.shape)
     label = jnp.broadcast_to(target.label[:, None], asked.shape)
     right = parsed.conclude == label
-    levels = range(3)
-    by_level = {k: asked & (label == k) for k in levels}
+    by_level = {k: asked & (label == k) for k in range(levels)}
+    formatted = asked & parsed.formatted[..., None]
     same = jnp.all((parsed.perceive == parsed.compare[..., None, :]) | ~target.streams[:, None, :, None], -2)
     same &= (parsed.compare == parsed.conclude) & (parsed.conclude >= 0)
     named = jnp.any(parsed.perceive >= 0, (-1, -2)) | jnp.any(parsed.compare >= 0, -1)
     unread = ~parsed.formatted | ~jnp.any((parsed.conclude >= 0) & target.asked[:, None], -1)
     return {
-        **{f"right_level_{k}": masked.mean(right, by_level[k]) for k in levels},
-        **{f"labels_level_{k}": jnp.sum(by_level[k]).astype(jnp.float32) for k in levels},
+        **{f"right_level_{k}": masked.mean(right, where) for k, where in by_level.items()},
+        **{f"labels_level_{k}": jnp.sum(where).astype(jnp.float32) for k, where in by_level.items()},
         "mode_share": _mode_share(parsed.conclude, asked),
         "label_mode_share": _mode_share(jnp.broadcast_to(label, asked.shape), asked),
-        "echo_share": masked.mean(same, asked & parsed.formatted[..., None]),
+        "echo_share": masked.mean(same, formatted),
+        "echo_right": masked.mean(right, formatted),
         "gamed_share": jnp.mean(named & unread),
     }
 
@@ -71,7 +82,7 @@ def reward_metrics(
 ) -> dict[str, Array]:
     """Mean of each term, shares of groups whose answers are all right or all wrong, and of groups left out."""
     return {
-        **{f"reward_{name}": jnp.mean(value) for name, value in terms.items()},
+        **{f"reward_{name}": masked.mean(value, finite[:, None]) for name, value in terms.items()},
         "all_right_share": jnp.mean(jnp.all(right, -1)),
         "none_right_share": jnp.mean(~jnp.any(right, -1)),
         "nonfinite_share": jnp.mean(~finite),

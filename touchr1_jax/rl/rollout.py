@@ -15,6 +15,7 @@ from flax import struct
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
+from touchr1_jax.models.layers import TEMPERATURES
 from touchr1_jax.models.lm import CompletionCaches, PrefixCache
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.policy_fns import PolicyFns
@@ -84,8 +85,12 @@ class SampleConfig:
     constraint: Constraint | None = None
 
     def __post_init__(self) -> None:
-        above(self, 0, "temperature", "top_p")
+        above(self, 0, "top_p")
         within(self, 0, 1, "top_p", "min_p")
+        within(self, *TEMPERATURES, "temperature")
+        if self.constraint is not None and self.length < self.constraint.shortest:
+            least = f"must be at least {self.constraint.shortest}, the shortest formatted answer with its end"
+            raise ValueError(f"length is {self.length}: {least}; raise it, or sample without constraint")
 
 
 def encode_prompts(

@@ -40,6 +40,12 @@ def require_stable_rewards(score: object) -> None:
         )
 
 
+def ordinal_levels(score: object) -> int:
+    """Most levels of an ordinal attribute of a score's language; 0 for a score without a `Parser`, which has none."""
+    parser = score.parser if isinstance(score, WeightedScore) else None
+    return parser.ordinal_levels if isinstance(parser, Parser) else 0
+
+
 NONFINITE_IN = "nonfinite_in_"
 """Prefix of the metrics that name a reward: the share of groups in which it was NaN or infinite."""
 
@@ -88,6 +94,7 @@ class WeightedScore:
         reward: Float[Array, "P G"],
         terms: Mapping[str, Float[Array, "P G"]],
         tokens: Int[Array, "P G T"],
+        finite: Bool[Array, "P"],
     ) -> Float[Array, "P G T"]:
         """`advantages.segment_advantages` of rollouts.
 
@@ -98,7 +105,7 @@ class WeightedScore:
             raise ValueError(f"parser is {self.parser!r}: must be a text.parser.Parser to tell segments; use one")
         settled = {n: SEGMENTS.index(r.settled) for n, r in self.rewards.items() if isinstance(r, Reward)}
         segment = jax.vmap(jax.vmap(self.parser.segments))(tokens)
-        return segment_advantages(algorithm, reward, terms, settled, segment)
+        return segment_advantages(algorithm, reward, terms, settled, segment, finite)
 
 
 def left_out_groups(
@@ -106,17 +113,22 @@ def left_out_groups(
 ) -> tuple[Float[Array, "D G"], dict[str, Float[Array, "D G"]], Bool[Array, "D"], dict[str, Float[Array, ""]]]:
     """Leave out groups with a NaN or infinite reward: the mean of all others replaces it and gives no gradient.
 
-    Groups whose rewards have no finite sum of squares are left out too: they have no σ, and all advantages would be 0.
+    Groups of which squares cannot be summed over the batch are left out too (`squares_fit`).
 
     Returns: Reward and terms without such numbers; true for each group that stays; and `nonfinite_in_TERM`, the share
-      of groups in which a term was not finite (`nonfinite_in_total`: every term was finite, but not their sum or its
+      of groups in which a term was not finite (`nonfinite_in_total`: every term was finite, but not their sum or a
       square).
     """
     is_finite = lambda x: jnp.all(jnp.isfinite(x), -1)
     by_term = {name: is_finite(term) for name, term in terms.items()}
     all_terms = functools.reduce(jnp.logical_and, by_term.values(), jnp.ones(reward.shape[:1], bool))
-    finite = all_terms & jnp.isfinite(jnp.sum(reward**2, -1))
+    finite = functools.reduce(jnp.logical_and, map(squares_fit, (reward, *terms.values())), all_terms)
     neutral = lambda x: neutralised(x, finite)
     shares = {f"{NONFINITE_IN}{name}": jnp.mean(~each) for name, each in by_term.items()}
     shares[f"{NONFINITE_IN}total"] = jnp.mean(all_terms & ~finite)
     return neutral(reward), {name: neutral(term) for name, term in terms.items()}, finite, shares
+
+
+def squares_fit(x: Float[Array, "D *n"]) -> Bool[Array, "D"]:
+    """Groups with D Σ x² < ∞, so that no σ is infinite, of a group or of the batch: all advantages would be 0."""
+    return jnp.isfinite(len(x) * jnp.sum(x**2, tuple(range(1, x.ndim))))

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 from touchr1_jax import masked
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rewards.accuracy import accuracy
-from touchr1_jax.rl.advantages import advantages, zero_variance
+from touchr1_jax.rl.advantages import advantages, of_kept_groups, zero_variance
 from touchr1_jax.rl.config import Algorithm, TactileUse
 from touchr1_jax.rl.counterfactual import Perturbed, drop_touch, noise_touch, shuffle_touch, swap_touch
 from touchr1_jax.rl.rollout import GRPOBatch
@@ -103,13 +103,18 @@ def bonus_metrics(
     terms: Mapping[str, Float[Array, "P G"]],
     bonus: Float[Array, "P G"],
     advantage: Float[Array, "P G"],
+    finite: Bool[Array, "P"],
 ) -> dict[str, Array]:
-    """Share of groups with different bonuses, and of those among them whose advantages ignore the bonuses."""
+    """Share of groups with different bonuses, and of those among them whose advantages ignore the bonuses.
+
+    Groups that are left out, not `finite`, are in neither share: alarm F15 counts them.
+    """
     if algorithm.tactile_use is TactileUse.LITERAL:
         reward = reward - terms[TERM]
         terms = {name: term for name, term in terms.items() if name != TERM}
-    moved = jnp.max(jnp.abs(advantage - advantages(algorithm, reward, terms)), -1)
-    differs = ~zero_variance(bonus)
+    without = of_kept_groups(algorithm, advantages(algorithm, reward, terms, finite), finite)
+    moved = jnp.max(jnp.abs(advantage - without), -1)
+    differs = finite & ~zero_variance(bonus)
     return {"bonus_telling_share": jnp.mean(differs), "bonus_cancelled_share": jnp.mean(differs & (moved < UNMOVED))}
 
 

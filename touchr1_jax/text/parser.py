@@ -40,6 +40,7 @@ class Parser:
     sensors: int
     sensor_of: np.ndarray  # int32 [events], the sensor that an event names, −1 for none
     levels_of: np.ndarray  # int32 [events, A], bit k where an event names level k of an attribute
+    ordinal_levels: int  # most levels of an ordinal attribute, 0 without any
 
     def __call__(self, tokens: Int[Array, "*T"]) -> Parsed:
         """Parse one completion; tokens from the first end token on are ignored.
@@ -144,6 +145,7 @@ def compile_parser(language: Language, tokenizer: Tokenizer) -> Parser:
         sensors=len(language.sensors),
         sensor_of=sensor_of,
         levels_of=levels_of,
+        ordinal_levels=max((len(a.levels) for a in language.attributes if a.ordinal), default=0),
     )
 
 

@@ -176,7 +176,8 @@ class _BankFeed(Feed):
         self._policy, self._bank, self._dropout = policy, jax.device_get(bank), dropout
         self._object, self._attribute = labelled_questions(np.asarray(bank.label))
         n = len(self._object)
-        order = functools.lru_cache(2)(lambda epoch: np.random.default_rng((seed, epoch)).permutation(n))
+        # (seed, batch) is the seed of what a batch draws (`Feed`), and a last 0 would change nothing
+        order = functools.lru_cache(2)(lambda epoch: np.random.default_rng((seed, epoch, 1)).permutation(n))
 
         def rows(batch: int, _: Any) -> Int[np.ndarray, "P"]:
             epoch, place = np.divmod(batch * batch_size + np.arange(batch_size), n)

@@ -227,22 +227,27 @@ def verified_answer(
 ) -> tuple[Int[np.ndarray, "T"], Bool[np.ndarray, "T"]]:
     """Tokens of the answer that SFT imitates, and which of them count: none if the label is unknown.
 
+    A sensor without evidence, equal log-probabilities as of a probe that was never fitted, repeats `compare`, what the
+    others show together; `compare` repeats the label if none has any.
+
     Args:
       policy: prompts and vocabulary.
       log_prob: each sensor's evidence about this contact.
       question: its number in the layout.
       label: of the contact.
-      streams: sensors that the question shows; without any, `compare` repeats the label.
+      streams: sensors that the question shows.
     """
     asked, length = policy.layout.asked[question], policy.model.completion_tokens
     if np.any(label[asked] < 0):
         return np.full(length, policy.tokenizer.pad_id, np.int32), np.zeros(length, bool)
-    together = label if not streams.any() else log_prob[streams].sum(0).argmax(-1)
+    lowest = np.where(np.isneginf(log_prob), np.inf, log_prob).min(-1)  # of the levels that an attribute has
+    told = streams[:, None] & (log_prob.max(-1) > lowest)
+    together = np.where(told.any(0), np.where(told[..., None], log_prob, 0).sum(0).argmax(-1), label)
     text = answer_text(
         policy.language,
         asked=asked,
         streams=streams,
-        perceive=log_prob.argmax(-1),
+        perceive=np.where(told, log_prob.argmax(-1), together),
         compare=together,
         conclude=label,
     )

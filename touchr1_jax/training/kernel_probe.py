@@ -114,7 +114,13 @@ def graded_targets(
       objects: [n], the object of each video.
       share: of the ratings in the target, 0 to 1.
       width: of the kernel, in units of the rating.
+
+    Raises:
+      ValueError: a video with weight whose level is unknown.
     """
+    unknown = np.flatnonzero((weight > 0) & np.any(label < 0, axis=1))
+    if len(unknown):
+        raise ValueError(f"label[{unknown[0]}] is {label[unknown[0]]}: must be ≥ 0 where weight is; set weight 0 there")
     hard = np.eye(LEVELS)[label]
     target = hard.copy()
     for a in range(label.shape[1]):

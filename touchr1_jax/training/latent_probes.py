@@ -88,14 +88,16 @@ def collapse_alarms(before: Mapping[str, float], now: Mapping[str, float]) -> li
 
         m_{t−1} ≤ bound,   m_t ≤ bound,   m_t ≤ m_{t−1}
 
-    In a healthy run, a moving target can be below its bound for some dozen steps before it rises again.
+    In a healthy run, a moving target can be below its bound for some dozen steps before it rises again.  NaN, of
+    latents that diverge or are all 0, passes every bound.
 
     Args:
       before: the previous measurement, of the trained encoder; names outside `BOUNDS` are ignored.
       now: the present measurement.
     """
+    sound = lambda name, bound: now[name] > before[name] or before[name] > bound or now[name] > bound
     return [
         Alarm(code="F11", meaning=meaning, value=now[name], bound=bound)
         for name, (bound, meaning) in BOUNDS.items()
-        if name in before and name in now and now[name] <= before[name] <= bound
+        if name in before and name in now and not sound(name, bound)
     ]

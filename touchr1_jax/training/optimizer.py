@@ -13,6 +13,7 @@ class OptimizerConfig:
     """AdamW with linear warm-up and cosine decay to `final_share` of the peak.
 
     `learning_rate` is the paper's; models trained from scratch multiply it by `lr_scale`, which every report prints.
+    `weight_decay` is of all that is trained, scales of norms, biases and both factors of adapters among them.
     """
 
     learning_rate: float

@@ -112,7 +112,7 @@ def test_plain_arrays_are_enough_and_misfits_are_named(asked):
         (TouchInput(frames=frames, force_n={"tac3d": np.zeros((2, 3))}), r"are \(2, 3\) and \(3,\): must be"),
         (TouchInput(frames=frames, force_n={"tac3d": np.full((3, 3), np.nan)}), "must be finite numbers"),
         (TouchInput(frames=frames, force_n={"gelsight": np.zeros((3, 3))}), "are of gelsight: must be of sensors with"),
-        (TouchInput(frames=frames, index={"tac3d": np.array([0, 1.5, 2])}), "whole numbers ≥ 0"),
+        (TouchInput(frames=frames, index={"tac3d": np.array([0, 1.5, 2])}), "whole numbers from 0"),
         (TouchInput(frames=frames, view=np.zeros((9, 9), np.uint8)), r"view is uint8\[9, 9\]: must be RGB"),
         ({"tac3d": np.zeros((3, 0, 0, 3), np.uint8)}, r"uint8\[3, 0, 0, 3\]: must be uint8"),
         ({"tac3d": 3}, r"must be uint8 \[F, H, W, 3\]"),
@@ -121,7 +121,7 @@ def test_plain_arrays_are_enough_and_misfits_are_named(asked):
         ({**frames, 3: frames["tac3d"]}, r"frames are of \['3'\]"),
         (TouchInput(frames=frames, force_n={"tac3d": np.full((3, 3), 1e300)}), "must be finite numbers"),
         (TouchInput(frames=frames, force_n={"tac3d": np.full((3, 3), "1")}), "must be finite numbers"),
-        (TouchInput(frames=frames, index={"tac3d": np.arange(3) + 2**40}), "whole numbers ≥ 0"),
+        (TouchInput(frames=frames, index={"tac3d": np.arange(3) + 2**30}), "whole numbers from 0"),
         (TouchInput(frames=frames, index={"tac3d": np.array([0, 2, 1], np.uint32)}), r"\[0 2 1\]: must increase"),
         (TouchInput(frames=frames, index={"tac3d": np.array([0, 1, 1])}), r"\[0 1 1\]: must increase"),
     ):

@@ -68,7 +68,12 @@ def test_recordings_are_matched_to_names(k):
 
 
 @pytest.mark.parametrize(
-    ("label", "count", "message"), [(LABEL, 100, "multiple of 24"), (np.zeros((9, 4), int), 24, "lacks levels")]
+    ("label", "count", "message"),
+    [
+        (LABEL, 100, "multiple of 24"),
+        (np.zeros((9, 4), int), 24, "lacks levels"),
+        (np.where(np.arange(4) == 2, -1, LABEL), 24, r"label\[0\] is \[.*-1.*\]: must be ≥ 0"),
+    ],
 )
 def test_questions_that_cannot_be_drawn(label, count, message):
     with pytest.raises(ValueError, match=message):

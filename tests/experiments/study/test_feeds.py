@@ -16,7 +16,14 @@ from sensors_io.pipeline import clip_batches
 from sensors_io.schema import LEVELS
 from tests.experiments import tiny
 from touchr1_jax.text.oracle import read
-from touchr1_jax.training.feeds import AnswerFeed, encoded_clips, falling_share, random_streams, take
+from touchr1_jax.training.feeds import (
+    AnswerFeed,
+    encoded_clips,
+    falling_share,
+    random_streams,
+    take,
+    verified_answer,
+)
 from touchr1_jax.training.packing import Packing
 from touchr1_jax.training.questions import QuestionFeed, equal_blocks, question_batch
 
@@ -190,6 +197,19 @@ def test_encoded_contacts_come_with_their_own_features_and_answers(policy, data,
     for i, a, streams, said in readings(policy, batch):
         assert said.conclude[a] == data.label[contacts[i], a]
         assert said.compare[a] == evidence[contacts[i]][streams, a].sum(0).argmax()
+
+
+def test_a_sensor_without_evidence_repeats_the_others_and_without_any_the_label(policy, evidence):
+    """A probe of too few labelled objects is not fitted: its level would be the first one, of every contact."""
+    label, streams, exists = np.array([2, 1, 1, 5]), np.array([True, True, True, False]), np.isfinite(evidence[0])
+    for some in (np.array([False, True, False, True]), np.zeros(4, bool)):
+        log_prob = np.where(exists, np.where(some[:, None, None], evidence[0], 0.0), -np.inf)
+        for a in range(4):
+            tokens, counts = verified_answer(policy, log_prob, a, label, streams)
+            said = read(policy.language, policy.tokenizer.decode(tokens[counts][:-1]))
+            together = evidence[0, 1, a].argmax() if some.any() else label[a]
+            assert [level[a] for level in said.perceive] == [together, together, together, -1]
+            assert (said.compare[a], said.conclude[a]) == (together, label[a])
 
 
 def test_a_question_of_grpo_comes_with_its_verified_answer(policy, questions, data, evidence):

@@ -41,6 +41,12 @@ def test_equal_rewards_give_exactly_zero(value, group, normalise):
         assert zero_variance(rewards).all()
 
 
+@pytest.mark.parametrize("comparison", Advantage)
+def test_equal_rewards_give_zero_without_epsilon_too(comparison):
+    reward = jnp.full((2, 3), 0.4)
+    assert not advantages(Paper(advantage=comparison, epsilon=0.0), reward, {"a": reward}).any()
+
+
 def test_rewards_of_equal_value_but_unequal_rounding_have_zero_variance():
     reward = jnp.array([0.6 + 0.3 + 0.1, 1.0, 0.1 + 0.2 + 0.7, np.float32(1) + np.float32(2e-7)], jnp.float32)
     assert zero_variance(reward)

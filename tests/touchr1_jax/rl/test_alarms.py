@@ -9,6 +9,7 @@ HEALTHY = {
     "middle_labels": 1 / 3,
     "middle_rate": 0.4,
     "echo_share": 0.7,
+    "echo_right": 0.7,
     "accuracy": 0.7,
     "grounding": 0.1,
     "control_drop": 0.4,
@@ -41,13 +42,13 @@ HEALTHY = {
 }
 FAILURES = [
     ("F1", {"middle_rate": 0.9}, 0.9 - 1 / 3),
-    ("F2", {"echo_share": 1.0, "accuracy": 0.33}, 0.67),
+    ("F2", {"echo_share": 1.0, "echo_right": 0.33, "accuracy": 0.33}, 0.67),
     ("F3", {"grounding": 3.0}, 3.0),
     ("F4", {"control_noise": 0.1, "control_order": 0.7}, 0.6),
     ("F5", {"bonus_cancelled_share": 0.3}, 0.75),
     ("F6", {"touch_score": 0.4, "tactile_credit_share": 0.3}, 0.3),
     ("F6", {"credit_unearned_share": 0.2}, 0.2),
-    ("F8", {"kl_cost_peak": 3.0, "accuracy": 0.5, "echo_share": 0.5}, 3.0),
+    ("F8", {"kl_cost_peak": 3.0, "accuracy": 0.5}, 3.0),
     ("F9", {"entropy": 0.01}, 0.02),
     ("F9", {"entropy": 2.5}, 2.0),
     ("F10", {"grounding_stream_1": 0.0}, 0.0),
@@ -56,6 +57,7 @@ FAILURES = [
     ("F10", {"touch_share": 0.0}, 0.0),
     ("F13", {"gamed_share": 0.5}, 0.5),
     ("F15", {"nonfinite_share": 0.1}, 0.1),
+    ("F15", {"nonfinite_share": 0.1, "drawn_nonfinite_share": 0.0}, 0.1),  # a KL in the reward, of the selected alone
     ("F16", {"sampler_gap": 0.4}, 0.4),
 ]
 
@@ -87,6 +89,7 @@ NO_FAILURE = {
     "low entropy of right answers": {"entropy": 0.01, "accuracy": 0.99},
     "low entropy of better answers": {"entropy": 0.01, "accuracy": 0.85},
     "a costly token, and answers hold": {"kl_cost_peak": 3.0},
+    "honest slots of half of the answers, the others have no format": {"accuracy": 0.35},
     "a bonus that hardly any group earns": {"bonus_telling_share": 0.01, "bonus_cancelled_share": 0.01},
 }
 
@@ -138,7 +141,7 @@ def test_honest_slots_never_agree_oftener_than_they_are_right():
     a = np.linspace(1 / 3, 1, 50)
     agree = a**2 + (1 - a) ** 2 / 2
     assert (agree <= a + 1e-12).all()
-    excess = [echo_excess({"echo_share": e, "accuracy": x}, {}) for e, x in zip(agree, a, strict=True)]
+    excess = [echo_excess({"echo_share": e, "echo_right": x}, {}) for e, x in zip(agree, a, strict=True)]
     np.testing.assert_allclose([excess[0], excess[-1]], 0, atol=1e-12)
 
 

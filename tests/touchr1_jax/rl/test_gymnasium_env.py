@@ -94,3 +94,6 @@ def test_episodes_at_once_are_those_alone():
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[:2], b[:2]), seen, before)
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[2], b[0]), seen, alone[0].begin(np.array([0])))
     np.testing.assert_array_equal(stepped[2], [True, True, True])
+    for action in (-1, together.actions):  # −1 would be the last action, and not counted as one
+        with pytest.raises(ValueError, match=rf"actions are \[.*{action}\]: must lie in 0 … {together.actions - 1}"):
+            together.step(np.array([0, 0, action]))

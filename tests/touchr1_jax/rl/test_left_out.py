@@ -91,7 +91,7 @@ def test_the_other_advantages_are_those_of_a_batch_without_the_group(comparison,
     """Also where they are compared with mean and σ of the whole batch, and count by the best of two rollouts."""
     rng = np.random.default_rng(0)
     a, b = (jnp.asarray(rng.normal(size=(5, 4)), jnp.float32) for _ in range(2))
-    algorithm, kept = Paper(advantage=comparison, best_of=best_of, epsilon=1e-9), np.array([0, 1, 3, 4])
+    algorithm, kept = Paper(advantage=comparison, best_of=best_of, epsilon=0.3), np.array([0, 1, 3, 4])
     alone = advantages(algorithm, (a + b)[kept], {"a": a[kept], "b": b[kept]})
     b = b.at[2, 1].set(jnp.nan)
     reward, terms, finite, _ = left_out_groups(a + b, {"a": a, "b": b})
@@ -113,6 +113,10 @@ def test_rewards_whose_spread_overflows_are_named_too():
     _, _, finite, shares = left_out_groups(big, {"a": big})
     np.testing.assert_array_equal(finite, [False, True])
     assert (shares["nonfinite_in_a"], shares["nonfinite_in_total"]) == (0, 0.5)
+    # those of each group are finite, of the batch not; those of the sum are, of its parts not
+    many, parts = jnp.full((4, 2), 1e19), {"a": big, "b": 1 - big}
+    assert not left_out_groups(many, {"a": many})[2].any()
+    np.testing.assert_array_equal(left_out_groups(jnp.ones((2, 2)), parts)[2], [False, True])
 
 
 PARAMS = {"w": jnp.arange(3.0)}

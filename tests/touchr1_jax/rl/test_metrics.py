@@ -32,7 +32,8 @@ def test_rollout_metrics_by_hand():
     reward = jnp.array([[1.0, 0.4], [0.0, 0.0]])
     rollout = Rollout(tokens=jnp.zeros((2, 2, 4), jnp.int32), log_prob=jnp.zeros((2, 2, 4)), mask=mask)
     target = tiny.target(np.array([0, 3]), np.array([2, 1]))
-    ours = rollout_metrics(rollout, reward, jnp.array([False, True]), parsed, target)
+    flags = jnp.array([False, True]), jnp.array([True, True])
+    ours = rollout_metrics(rollout, reward, *flags, parsed, target)
     expected = {
         "reward": 0.35,
         "reward_std": 0.15,
@@ -48,8 +49,10 @@ def test_rollout_metrics_by_hand():
     for levels, below, middle in ((2, 1, (0.0, 0.0)), (5, 0, (0.5, 1.0))):  # two levels have no middle one
         changed = dataclasses.replace(parsed, conclude=parsed.conclude - below)
         scale = dataclasses.replace(target, levels=jnp.full_like(target.levels, levels))
-        found = rollout_metrics(rollout, reward, jnp.array([False, True]), changed, scale)
+        found = rollout_metrics(rollout, reward, *flags, changed, scale)
         assert (found["middle_rate"], found["middle_labels"]) == middle
+    without_last = rollout_metrics(rollout, reward, flags[0], ~flags[0], parsed, target)
+    assert_metrics({n: without_last[n] for n in ("reward", "reward_std")}, {"reward": 0.7, "reward_std": 0.3})
 
 
 def test_answer_metrics_by_hand():
@@ -76,19 +79,23 @@ def test_answer_metrics_by_hand():
         "mode_share": 0.6,  # 2 in three of the five ordinal answers
         "label_mode_share": 4 / 6,
         "echo_share": 0.4,  # the first rollouts of both questions for hardness, of five formatted ordinal answers
+        "echo_right": 0.6,  # among these five
         "gamed_share": 0.25,  # roughness without format, material without a conclusion
     }
-    found = answer_metrics(parsed, tiny.target(attribute, np.array([2, 0, 2, 1])))
+    found = answer_metrics(parsed, tiny.target(attribute, np.array([2, 0, 2, 1])), levels=3)
     assert_metrics(found, expected)
     five = dataclasses.replace(parsed, conclude=jnp.where(parsed.conclude == 2, 4, parsed.conclude))
-    assert answer_metrics(five, tiny.target(attribute, np.array([4, 0, 4, 1])))["mode_share"] == found["mode_share"]
+    of_five = answer_metrics(five, tiny.target(attribute, np.array([4, 0, 4, 1])), levels=5)
+    assert of_five["mode_share"] == found["mode_share"]
+    assert [float(of_five[f"labels_level_{k}"]) for k in range(5)] == [2, 0, 0, 0, 4]
+    assert (of_five["right_level_4"], of_five["right_level_2"]) == (found["right_level_2"], 0)
 
 
 def test_metrics_of_rewards_and_advantages_by_hand():
     reward = jnp.array([[1.0, 0.0], [0.5, 0.25], [0.4, 0.4], [0.0, 0.0]])
     right = jnp.array([[True, True], [True, False], [False, False], [False, False]])
     found = reward_metrics({"a": reward}, right, jnp.array([True, True, True, False]))
-    expected = {"reward_a": 2.55 / 8, "all_right_share": 0.25, "none_right_share": 0.5, "nonfinite_share": 0.25}
+    expected = {"reward_a": 2.55 / 6, "all_right_share": 0.25, "none_right_share": 0.5, "nonfinite_share": 0.25}
     assert_metrics(found, expected)
     advantage = jnp.array([[1.0, -3.0], [2.0, -2.0], [0.0, 0.0], [0.0, 0.0]])
     expected = {"advantage_abs": 1.0, "advantage_peak": 3.0, "lively_groups": 2.0}

@@ -20,6 +20,7 @@ from touchr1_jax.rl.config import (
     Paper,
     ReinforcePlusPlus,
     Rloo,
+    TactileUse,
     at_precision,
 )
 from touchr1_jax.rl.enumerated import LevelRewards
@@ -385,7 +386,12 @@ def test_metrics_of_minibatches_count_prompts_and_weigh_streams_by_them():
         ({"reference_share": 0.0, "reference_every": 2}, "reference_share is 0.0: must lie in 0 < share ≤ 1"),
         ({"reference_share": 0.5}, "reference_share is 0.5, but reference_every is None: set it"),
         ({"importance_sequence": True}, "importance_sequence is True, but importance_cap is None: set it"),
-        ({"kl_in_reward": True, "advantage": Advantage.PER_REWARD}, "kl_in_reward is True: must be False for PER_REW"),
+        ({"kl_in_reward": True, "beta": 0.0}, "kl_in_reward is True, but beta is 0.0: set it or drop kl_in_reward"),
+        ({"kl_in_reward": True, "advantage": Advantage.PER_REWARD}, "kl_in_reward is True: must go .* takes beta away"),
+        (
+            {"tactile_use": TactileUse.LITERAL, "advantage": Advantage.PER_REWARD},
+            "tactile_use is .*LITERAL: must go for PER_REWARD, whose σ takes tactile_weight away",
+        ),
     ],
 )
 def test_bad_options_are_named(change, message):
@@ -397,6 +403,7 @@ def test_bad_options_are_named(change, message):
     ("change", "message"),
     [
         ({"temperature": 0.0}, "temperature is 0.0"),
+        ({"temperature": 1e8}, "temperature is 100000000.0: must lie in 1e-06 … 1000000.0"),  # would draw banned tokens
         ({"top_p": 0.0}, "top_p is 0.0"),
         ({"min_p": 1.5}, "min_p is 1.5"),
         ({"group": 1, "algorithm": ReinforcePlusPlus(enumerated=Norm.NONE)}, "group is 1: must be at least 2"),

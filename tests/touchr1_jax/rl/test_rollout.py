@@ -10,6 +10,7 @@ import pytest
 from tests.touchr1_jax import tiny
 from touchr1_jax.models.lm import PrefixCache
 from touchr1_jax.rl.rollout import SampleConfig, inverse_draw, make_answer, sample
+from touchr1_jax.text.constraint import compile_constraint
 from touchr1_jax.text.parser import compile_parser
 
 V, PAD, END, STOP = 8, 0, 1, 2
@@ -51,6 +52,13 @@ def test_tokens_masks_and_log_probabilities_of_a_script(said):
     np.testing.assert_array_equal(said.mask, np.repeat(mask[:, None], 2, 1))
     peak = 20 - np.log(np.exp(20) + V - 1)
     np.testing.assert_allclose(said.log_prob, np.where(said.mask, peak, 0), atol=1e-6)
+
+
+def test_an_answer_that_cannot_be_finished_is_refused():
+    """Every token would be forbidden, and the first of the vocabulary drawn."""
+    least = compile_constraint(tiny.LANGUAGE, tiny.TOKENIZER)
+    with pytest.raises(ValueError, match=f"length is 6: must be at least {least.shortest}, the shortest formatted"):
+        dataclasses.replace(CONFIG, constraint=least)
 
 
 @pytest.mark.long
@@ -118,7 +126,7 @@ def test_inverse_draws_by_hand():
 def test_settings_of_the_sampler_never_change():
     with pytest.raises(dataclasses.FrozenInstanceError):
         CONFIG.greedy = False
-    with pytest.raises(ValueError, match=r"temperature is 0\.0: must be above 0"):  # drew token 0, of NaN
+    with pytest.raises(ValueError, match=r"temperature is 0\.0: must lie in 1e-06 …"):  # drew token 0, of NaN
         dataclasses.replace(CONFIG, greedy=False, temperature=0.0)
 
 

@@ -7,8 +7,8 @@ import pytest
 
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.rewards.examples import make_parsed, make_target
-from touchr1_jax.rl.advantages import advantages
-from touchr1_jax.rl.config import Paper, Stable, TactileUse
+from touchr1_jax.rl.advantages import advantages, of_kept_groups
+from touchr1_jax.rl.config import Advantage, Paper, Stable, TactileUse
 from touchr1_jax.rl.credit_odds import CREDIT, HELPED, HINDERED, credit_odds, false_credit
 from touchr1_jax.rl.tactile_use import TERM, bar, bonus_metrics, literal, recommended, right, tactile_bonus
 from touchr1_jax.types import Parsed
@@ -124,6 +124,16 @@ def test_a_literal_bonus_that_follows_the_reward_is_cancelled(form, cancelled):
     after = advantages(algorithm, reward, terms)
     if form is TactileUse.RECOMMENDED:
         after += added - added.mean(-1, keepdims=True)
-    found = bonus_metrics(algorithm, reward, terms, bonus, after)
+    found = bonus_metrics(algorithm, reward, terms, bonus, after, jnp.ones(3, bool))
     assert found["bonus_telling_share"] == pytest.approx(2 / 3)
     assert found["bonus_cancelled_share"] == pytest.approx(cancelled)
+
+
+@pytest.mark.parametrize("comparison", [Advantage.GROUP, Advantage.GLOBAL])
+def test_a_group_that_is_left_out_says_nothing_of_the_bonus(comparison):
+    """Its advantages ignore the bonus, as they ignore all; the σ of the others is not that of all groups either."""
+    algorithm, finite = Paper(advantage=comparison, tactile_use=TactileUse.RECOMMENDED), jnp.array([True, False, True])
+    reward, bonus = jnp.array([[1.0, 0.0], [0.5, 0.5], [1.0, 0.0]]), jnp.array([[0.0, 0.0], [1.0, 0.0], [1.0, 0.0]])
+    after = of_kept_groups(algorithm, advantages(algorithm, reward, {"a": reward}), finite)
+    found = bonus_metrics(algorithm, reward, {"a": reward}, bonus, after, finite)
+    assert found == dict.fromkeys(("bonus_telling_share", "bonus_cancelled_share"), pytest.approx(1 / 3))

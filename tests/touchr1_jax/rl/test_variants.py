@@ -12,7 +12,6 @@ from tests.touchr1_jax import tiny
 from tests.touchr1_jax.rl.test_grpo import FNS, FROZEN, P, score
 from touchr1_jax.rewards import make_rewards, uniform_prior
 from touchr1_jax.rl.config import (
-    Advantage,
     Cispo,
     Dapo,
     DrGrpo,
@@ -158,9 +157,8 @@ def test_buckets_must_ascend_below_the_length():
     [
         Stable(tactile_margin=0.0, controls=1),
         pytest.param(Paper(tactile_use=TactileUse.LITERAL), marks=pytest.mark.slow),
-        pytest.param(Paper(tactile_use=TactileUse.LITERAL, advantage=Advantage.PER_REWARD), marks=pytest.mark.slow),
     ],
-    ids=["stable", "literal", "literal, per reward"],
+    ids=["stable", "literal"],
 )
 def test_tactile_use_samples_the_controls(algorithm):
     state, metrics = take(of(algorithm), seed=0)

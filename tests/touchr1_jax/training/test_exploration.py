@@ -49,6 +49,15 @@ def test_random_trajectories_are_legal_and_answer_by_the_label():
     assert counts.min() > 10
 
 
+def test_the_order_of_the_questions_does_not_tell_what_a_batch_draws():
+    """Each has random bits of its own: of epoch 0 and of batch 0 among them."""
+    feed, drawn = ActiveFeed(POLICY, WHOLE, batch_size=8, seed=3), []
+    feed.make = lambda element, rng: drawn.append((element, rng.permutation(len(feed._object))))
+    next(feed)
+    order, bits = drawn[0]
+    assert not np.array_equal(order, bits[: len(order)])
+
+
 def test_batches_come_again_from_their_state():
     feed = ActiveFeed(POLICY, WHOLE, batch_size=4, seed=0, dropout=0.3)
     next(feed)

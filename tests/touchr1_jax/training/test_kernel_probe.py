@@ -76,6 +76,9 @@ def test_graded_targets_by_hand():
     np.testing.assert_array_equal(
         graded_targets(label, rating, np.ones(4), objects, share=0.0, width=1.0)[:, 0], ONE_HOT[label[:, 0]]
     )
+    label[2] = -1  # would be the last level
+    with pytest.raises(ValueError, match=r"label\[2\] is \[-1\]: must be ≥ 0"):
+        graded_targets(label, rating, np.ones(4), objects, share=0.5, width=1.0)
 
 
 def test_ranks_ignore_monotone_changes():

@@ -70,3 +70,6 @@ def test_what_comes_once_or_recovers_raises_no_alarm():
     assert collapse_alarms({"kept": 0.9}, {"kept": 0.3}) == []
     assert collapse_alarms({"kept": 0.3}, {"kept": 0.4}) == []
     assert len(collapse_alarms({"kept": 0.4}, {"kept": 0.3})) == 1
+    for before in (0.4, np.nan):
+        assert len(collapse_alarms({"kept": before}, {"kept": np.nan})) == 1
+    assert collapse_alarms({"kept": np.nan}, {"kept": 0.9}) == collapse_alarms({"kept": 0.9}, {"kept": np.nan}) == []
