@@ -29,7 +29,7 @@ from experiments.core.artifacts import (
 from experiments.core.progress import Advance, Loop, ProgressCallback, TrainingSample, Watcher, show_progress
 from experiments.core.stopping import Stopping
 from sensors_io.arrays import ArraysError, load_arrays
-from sensors_io.json_files import CHECKSUM, seal, unseal
+from sensors_io.json_files import CHECKSUM, require_regular, seal, unseal
 from sensors_io.units import HERE, Launcher
 from touchr1_jax.distributed.processes import SINGLE_PROCESS, ProcessGroup, SingleDevice
 from touchr1_jax.training.compilation import drop_programs
@@ -358,8 +358,9 @@ def _whole_lines(path: Path) -> list[str]:
     if not path.exists():
         return []
     try:
+        require_regular(path)
         lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-    except UnicodeDecodeError as error:
+    except ValueError as error:  # also one of text that is no UTF-8
         raise _damaged(path, str(error)) from error
     if not lines or lines[-1].endswith("\n"):
         return lines
