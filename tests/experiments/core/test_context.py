@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from experiments.core.artifacts import DamagedFileError, jsonable
-from experiments.core.context import MetricLog, read_metrics
+from experiments.core.metric_log import MetricLog, read_metrics
 from experiments.core.progress import Loop, show_progress
 
 
@@ -61,6 +61,33 @@ def test_every_flipped_bit_of_a_log_is_named_or_harmless(tmp_path):
         with contextlib.suppress(DamagedFileError):
             MetricLog(path).close()
             assert read_metrics(tmp_path) == rows, bit
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "7", "[]", "null", "{}", '{"stage": "sft/0"}', '{"stage": 3, "step": 1}', '{"stage": "sft/0", "step": "1"}',
+        '{"stage": "sft/0", "step": true}', '{"stage": "sft/0", "step": 1, "loss": NaN}', "\ufeff{}", "",
+        '{"stage": "sft/0", "step": 1, "loss": 1e999}', '{"stage": "sft/0", "step": 1, "loss": 1%s}' % ("0" * 400),
+        '{"stage": "sft/0", "step": 9, "loss": 0.1}\n{"stage": "sft/0", "step": 9, "loss": 0.1}',
+    ],
+)  # fmt: skip
+def test_a_foreign_line_is_named_before_anything_is_trained(tmp_path, line):
+    path = tmp_path / "metrics.jsonl"
+    log_steps(path, "sft/0", range(2))
+    content = path.read_text() + line + "\n"
+    path.write_text(content)
+    for read in (MetricLog, lambda path: read_metrics(path.parent)):
+        with pytest.raises(DamagedFileError, match=r"metrics\.jsonl is damaged \(.*: put a copy back"):
+            read(path)
+    assert path.read_text() == content
+
+
+def test_other_ends_of_lines_are_read(tmp_path):
+    log_steps(tmp_path / "metrics.jsonl", "sft/0", range(2))
+    rows = read_metrics(tmp_path)
+    (tmp_path / "metrics.jsonl").write_bytes((tmp_path / "metrics.jsonl").read_bytes().replace(b"\n", b"\r\n"))
+    assert read_metrics(tmp_path) == rows
 
 
 @pytest.mark.parametrize("stage", ["", "/sft", "sft/", "../sft", "sft/..", "a b", "sft//0"])
