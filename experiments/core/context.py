@@ -32,6 +32,8 @@ from touchr1_jax.training.compilation import drop_programs
 
 T = TypeVar("T")
 
+_LOGGED = "logged"  # folder in `stages` for what `Context.ended` keeps
+
 _STAGE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*(?:/[A-Za-z0-9_][A-Za-z0-9_.\-]*)*")
 
 
@@ -104,7 +106,24 @@ class Context:
         """Drop the logged lines of a stage at or past a step; needed only where the first new line may come later."""
         _checked(stage)
         if self._log is not None:
+            self._stage_file(f"{_LOGGED}/{stage}").unlink(missing_ok=True)
             self._log.rewind(stage, step)
+
+    def ended(self, stage: str) -> None:
+        """Keep the number and the checksum of the lines of a stage that has ended, for `require_log`."""
+        if self._log is not None:
+            write_sealed(self._stage_file(f"{_LOGGED}/{stage}"), {"lines": self._log.summary(stage)})
+
+    def require_log(self) -> None:
+        """`DamagedFileError` unless the log has the lines of all stages that have ended; no other look may be taken."""
+        folder = self.directory / "stages" / _LOGGED
+        if self._log is None:
+            return
+        for path in sorted(folder.rglob("*.json")):
+            stage, kept = path.relative_to(folder).with_suffix("").as_posix(), read_json(path)["lines"]
+            if self._log.summary(stage, kept[0]) != kept:
+                how = f"of the {kept[0]} lines of stage {stage} some are missing or changed"
+                raise damaged_log(self.directory / "metrics.jsonl", how)
 
     def sort_log(self) -> None:
         """Put the lines of the log in the order of the seeds, as if one had been trained after the other."""

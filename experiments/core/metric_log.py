@@ -4,6 +4,7 @@ import contextlib
 import json
 import os
 import threading
+import zlib
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -44,6 +45,12 @@ class MetricLog:
             lines = _whole_lines(self._path)
             self._replace(lines, sorted(lines, key=lambda line: _seed(_row(line, self._path)["stage"])))
 
+    def summary(self, stage: str, first: int | None = None) -> list[int]:
+        """The number of lines of a stage, or of its first ones, and their CRC-32."""
+        with self._lock:
+            lines = [line for line in _whole_lines(self._path) if _row(line, self._path)["stage"] == stage][:first]
+        return [len(lines), zlib.crc32("".join(lines).encode())]
+
     def _replace(self, lines: list[str], by: list[str]) -> None:
         if lines != by:
             self._file.close()
@@ -81,7 +88,12 @@ def _rows(path: Path) -> list[dict[str, Any]]:
     lines = _whole_lines(path)
     if len(set(lines)) < len(lines):
         raise damaged_log(path, f"a line is there twice, {Counter(lines).most_common(1)[0][0][:80]!r}")
-    return [_row(line, path) for line in lines]
+    rows, steps = [_row(line, path) for line in lines], dict[str, int]()
+    for row in rows:
+        if row["step"] < steps.setdefault(row["stage"], row["step"]):
+            raise damaged_log(path, f"step {row['step']} of stage {row['stage']} follows {steps[row['stage']]}")
+        steps[row["stage"]] = row["step"]
+    return rows
 
 
 def _whole_lines(path: Path) -> list[str]:

@@ -366,6 +366,7 @@ def _compute(
         events += [watchers.WeightsAndBiases(directory, description)] if command.wandb else []
         context = make_context(Console(emoji=False), [watchers.Latest(directory), page, *events])
         with contextlib.closing(context), context.timed("total"), page.kept_fresh():
+            context.require_log()
             results = experiment.run(command.config, context)
         tables = (*results.tables, *left_out_tables(read_metrics(directory)))
         timing, drawn = {**context.timing(), **results.timing}, {**experiment.curves, **results.curves}

@@ -69,6 +69,7 @@ def test_every_flipped_bit_of_a_log_is_named_or_harmless(tmp_path):
         "7", "[]", "null", "{}", '{"stage": "sft/0"}', '{"stage": 3, "step": 1}', '{"stage": "sft/0", "step": "1"}',
         '{"stage": "sft/0", "step": true}', '{"stage": "sft/0", "step": 1, "loss": NaN}', "\ufeff{}", "",
         '{"stage": "sft/0", "step": 1, "loss": 1e999}', '{"stage": "sft/0", "step": 1, "loss": 1%s}' % ("0" * 400),
+        '{"stage": "sft/0", "step": 0, "loss": 0.1}',
         '{"stage": "sft/0", "step": 9, "loss": 0.1}\n{"stage": "sft/0", "step": 9, "loss": 0.1}',
     ],
 )  # fmt: skip
@@ -81,6 +82,22 @@ def test_a_foreign_line_is_named_before_anything_is_trained(tmp_path, line):
         with pytest.raises(DamagedFileError, match=r"metrics\.jsonl is damaged \(.*: put a copy back"):
             read(path)
     assert path.read_text() == content
+
+
+@pytest.mark.parametrize("kept", [[], [0, 2, 3], [0, 1], [0, 1, 1, 2, 3], [0, 2, 1, 3]])
+def test_lines_of_a_stage_that_has_ended_are_missed(context, kept):
+    for step in range(3):
+        context.log("sft/0", step, loss=1 / (1 + step))
+    context.ended("sft/0")
+    context.log("sft/0", 3, probe=0.5)
+    context.require_log()
+    path = context.directory / "metrics.jsonl"
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(lines[n] for n in kept))
+    with pytest.raises(DamagedFileError, match="of the 3 lines of stage sft/0 some are missing or changed"):
+        context.require_log()
+    context.rewind("sft/0", 2)
+    context.require_log()
 
 
 def test_other_ends_of_lines_are_read(tmp_path):
