@@ -6,11 +6,11 @@ import os
 import threading
 import zlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.core.artifacts import DamagedFileError, jsonable, write_text
+from experiments.core.artifacts import DamagedFileError, UnwrittenError, jsonable, write_text
 from experiments.core.progress import Watcher
 from sensors_io.json_files import CHECKSUM, require_regular, seal, unseal
 
@@ -66,17 +66,26 @@ class MetricLog:
         with self._lock:
             if stage not in self._seen:
                 self.rewind(stage, step)
-            self._file.write(seal(json.dumps({"stage": stage, "step": step, **values})) + "\n")
-            self._file.flush()
+            with self._named():
+                self._file.write(seal(json.dumps({"stage": stage, "step": step, **values})) + "\n")
+                self._file.flush()
             for watcher in self._watchers:
                 watcher.logged(stage, step, values)
 
     def close(self) -> None:
         """Flush the file to the disk and close it."""
         if not self._file.closed:  # a signal may have come inside `rewind`
-            self._file.flush()
-            os.fsync(self._file.fileno())
-            self._file.close()
+            with self._named():
+                self._file.flush()
+                os.fsync(self._file.fileno())
+                self._file.close()
+
+    @contextlib.contextmanager
+    def _named(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise UnwrittenError(f"{self._path} cannot be written ({error}): free some space, then continue") from error
 
 
 def read_metrics(directory: Path) -> list[dict[str, Any]]:

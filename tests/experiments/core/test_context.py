@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from experiments.core.artifacts import DamagedFileError, jsonable
+from experiments.core.artifacts import DamagedFileError, UnwrittenError, jsonable
 from experiments.core.metric_log import MetricLog, read_metrics
 from experiments.core.progress import Loop, show_progress
+from experiments.faults.fixtures import full_disk
+from tests.sensors_io.checks import refused
 
 
 def log_steps(path, stage, steps):
@@ -98,6 +100,20 @@ def test_lines_of_a_stage_that_has_ended_are_missed(context, kept):
         context.require_log()
     context.rewind("sft/0", 2)
     context.require_log()
+
+
+def test_a_log_on_a_full_disk_is_named_and_goes_on(tmp_path):
+    log_steps(tmp_path / "whole.jsonl", "sft/0", range(9))
+    path = tmp_path / "metrics.jsonl"
+    said = r"metrics\.jsonl cannot be written \(.*\): free some space, then continue"
+    with full_disk(tmp_path, 200):
+        log = MetricLog(path)
+        write = lambda: [log.append("sft/0", step, {"loss": 1 / (1 + step)}) for step in range(9)]
+        refused(UnwrittenError, said, write)
+        refused(UnwrittenError, said, log.close)
+    log.close()
+    log_steps(path, "sft/0", range(len(read_metrics(tmp_path)), 9))
+    assert path.read_bytes() == (tmp_path / "whole.jsonl").read_bytes()
 
 
 def test_other_ends_of_lines_are_read(tmp_path):
