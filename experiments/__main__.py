@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import sys
 
+from sensors_io.errors import require_words
 from sensors_io.signals import end_as_interrupted, leave_interrupted, say
 
 SIGNALLED = 128
@@ -37,6 +38,11 @@ def main() -> None:
         from sensors_io.commands.console import print_in_any_encoding
 
         print_in_any_encoding()
+        try:
+            require_words(arguments)
+        except ValueError as error:
+            say(f"ValueError: {error}")
+            leave(2)
         if arguments and arguments[0] in ASKING:
             from experiments.ask.command import run_asking
 

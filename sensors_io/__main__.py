@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from sensors_io.errors import UserError
+from sensors_io.errors import UserError, require_words
 from sensors_io.signals import end_as_interrupted, leave_interrupted, say
 
 PROG = "python -m sensors_io"
@@ -81,6 +81,7 @@ def _run(args: list[str]) -> int:
 
     try:
         try:
+            require_words(args)
             command = read(args)
             require_possible(command)
         except ValueError as error:  # a configuration refuses its own values

@@ -8,7 +8,8 @@ fields and forces as int16 counts of a recorded scale:
 
     counts = round(x / scale),   scale = the smallest power of two with max|x| ≤ 32767 · scale
 
-The error is at most scale/2 and must not exceed `TOLERANCE`; forces and moments past that range are stored as float32.
+The error is at most scale/2 and must not exceed `TOLERANCE`; forces and moments past that range are stored as float32,
+up to `LARGEST`.
 A power of two makes decoding exact in float32, so that storing a decoded sequence again gives the same bytes: copies of
 a data set never drift.
 
@@ -46,6 +47,9 @@ WIDEST: Mapping[str, float] = {
     name: 32767 * 2.0 ** math.floor(math.log2(2 * tolerance)) for name, tolerance in TOLERANCE.items()
 }
 """Largest value of each quantised array that int16 carries within its tolerance: 32 mm, 64 N, 512 N mm."""
+
+LARGEST: Mapping[str, float] = {**WIDEST, "force_n": 1e6, "target_force_n": 1e6, "moment_nmm": 1e9}
+"""Largest value that is stored.  No gel bears a greater force, and squares of 10²⁰ N leave float32 in training."""
 
 _MAGIC, _OLD_MAGIC = b"TCH2", b"TCH1"
 _PREFIX = struct.Struct("<4sII")
@@ -157,8 +161,8 @@ def quantise(name: str, x: np.ndarray, *, where: str) -> tuple[np.ndarray, float
     scale = math.ldexp(1.0, exponent - (mantissa == 0.5))
     if scale > 2 * TOLERANCE[name]:
         raise SchemaError(
-            f"{where}: {name} reaches {top:g}: int16 carries at most {WIDEST[name]:g} at an error of "
-            f"{TOLERANCE[name]:g}; check the unit or drop the broken frames"
+            f"{where}: {name} reaches {top:g}: records hold at most {LARGEST[name]:g}; check the unit or drop the "
+            "broken frames"
         )
     return np.rint(x / np.float32(scale)).astype(np.int16), scale
 
@@ -193,7 +197,7 @@ def _pack(kind: str, plain: Mapping[str, Any], arrays: Mapping[str, np.ndarray |
 
 def _wide(name: str, x: np.ndarray) -> bool:
     """True of a force or moment that int16 cannot carry; a field past its range is a broken sample or another unit."""
-    return name not in FIELDS and WIDEST[name] < float(np.abs(x).max(initial=0.0)) < math.inf
+    return name not in FIELDS and WIDEST[name] < float(np.abs(x).max(initial=0.0)) <= LARGEST[name]
 
 
 def _open(data: bytes, kind: str) -> tuple[dict[str, Any], memoryview]:

@@ -3,6 +3,7 @@
 import errno
 import os
 import struct
+from collections.abc import Sequence
 
 MALFORMED = (
     ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, MemoryError, RecursionError,
@@ -22,6 +23,18 @@ def of_system(error: BaseException) -> bool:
 
 class UserError(Exception):
     """Its message names the field, the value, the constraint and the fix, so that a command prints it as one line."""
+
+
+def require_words(args: Sequence[str]) -> None:
+    """Refuse an empty word of a command line: as a path it would be the current folder, as a name none.
+
+    Raises:
+      ValueError: naming the option before it.
+    """
+    for before, word in zip(["", *args], args, strict=False):
+        if not word or (word.startswith("--") and word.endswith("=")):
+            option = word.removesuffix("=") or (before if before.startswith("--") else "an argument")
+            raise ValueError(f"{option} is '': must not be empty; give its value, or leave it out")
 
 
 def path_text(path: str | os.PathLike[str]) -> str:

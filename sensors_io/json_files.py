@@ -42,6 +42,16 @@ def require_writable(path: pathlib.Path) -> None:
         raise PermissionError(f"{path.parent} is read-only: must be writable; name another folder")
 
 
+def require_regular(path: pathlib.Path) -> None:
+    """Refuse a folder, a pipe or a device in the place of a file: who reads a pipe waits, maybe for ever.
+
+    Raises:
+      ValueError: it is none; the caller names it.
+    """
+    if path.exists() and not path.is_file():
+        raise ValueError("it is a folder, a pipe or a device")
+
+
 def read_json(path: pathlib.Path) -> Any:
     """The value of a JSON file, without its checksum.
 

@@ -3,6 +3,7 @@
 import collections
 import dataclasses
 from collections.abc import Iterable, Mapping
+from collections.abc import Sequence as Seq
 
 import numpy as np
 from rich.table import Column, Table
@@ -132,8 +133,21 @@ def import_table(report: ImportReport) -> Table:
     table.add_row("skipped", str(len(report.skipped)))
     table.add_row("labels missing", str(len(report.unlabelled)))
     table.add_row("nobody annotated", ", ".join(report.unannotated) or "·")
+    _add_skips(table, (*report.skipped, *report.unlabelled))
+    return table
+
+
+def skip_table(skipped: Seq[Skip], title: str) -> Table:
+    """Table of what was left out, as in `import_table`."""
+    table = Table("what", "count or reason", title=title)
+    table.add_row("skipped", str(len(skipped)))
+    _add_skips(table, skipped)
+    return table
+
+
+def _add_skips(table: Table, skipped: Seq[Skip]) -> None:
     by_reason: dict[str, list[Skip]] = {}
-    for skip in (*report.skipped, *report.unlabelled):
+    for skip in skipped:
         by_reason.setdefault(skip.reason, []).append(skip)
     for reason, skips in by_reason.items():
         if len(skips) > SKIPS_BY_NAME:
@@ -141,4 +155,3 @@ def import_table(report: ImportReport) -> Table:
         else:
             for skip in skips:
                 table.add_row(skip.name, reason)
-    return table

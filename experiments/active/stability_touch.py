@@ -27,8 +27,9 @@ from experiments.active.policies import explore
 from experiments.active.report import found_questions
 from experiments.active.world import TouchWorld, WorldConfig, make_world
 from experiments.core.concurrency import concurrently
-from experiments.core.context import Context, read_metrics
+from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
+from experiments.core.metric_log import read_metrics
 from experiments.core.results import Requirement, Results, Table, at_least, named_table
 from experiments.core.runner import Experiment
 from experiments.study.alarm_log import ALARM

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from sensors_io.json_files import seal, unseal
+from sensors_io.json_files import require_regular, seal, unseal
 
 
 class DamagedFileError(ValueError):
@@ -104,6 +104,7 @@ def write_sealed(path: Path, value: Any) -> None:
 def read_json(path: Path) -> Any:
     """The value of a JSON file, without its checksum; `DamagedFileError` if either does not hold."""
     try:
+        require_regular(path)
         return unseal(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise DamagedFileError(

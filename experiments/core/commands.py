@@ -141,7 +141,7 @@ class CompareCommand:
         try:
             found = [runs.read_run(runs.locate(name, self.runs_dir)) for name in self.runs]
             print_lines(compare_runs(found, self.most))
-        except (ComparisonError, DamagedFileError, FileNotFoundError) as error:
+        except (ComparisonError, DamagedFileError, OSError) as error:
             print_error(f"{type(error).__name__}: {error}")
             return 1
         return 0
@@ -232,7 +232,7 @@ def _past_runs(home: Path) -> tuple[list[runs.PastRun], list[str]]:
     for directory in runs.started(home):
         try:
             past.append(runs.read_run(directory))
-        except (DamagedFileError, FileNotFoundError) as error:
+        except (DamagedFileError, OSError) as error:
             damaged.append(str(error))
     return past, damaged
 

@@ -5,8 +5,6 @@ Each computation is a cached *stage*, named `PHASE/SEED` or `PHASE/ARM/SEED`, fo
 """
 
 import contextlib
-import json
-import os
 import re
 import threading
 import time
@@ -20,81 +18,23 @@ from rich.console import Console
 from experiments.core.artifacts import (
     DamagedFileError,
     UnwrittenError,
-    jsonable,
     read_json,
     write_arrays,
     write_sealed,
-    write_text,
-)
+)  # fmt: skip
+from experiments.core.metric_log import MetricLog, damaged_log, read_metrics
 from experiments.core.progress import Advance, Loop, ProgressCallback, TrainingSample, Watcher, show_progress
 from experiments.core.stopping import Stopping
 from sensors_io.arrays import ArraysError, load_arrays
-from sensors_io.json_files import CHECKSUM, seal, unseal
 from sensors_io.units import HERE, Launcher
 from touchr1_jax.distributed.processes import SINGLE_PROCESS, ProcessGroup, SingleDevice
 from touchr1_jax.training.compilation import drop_programs
 
 T = TypeVar("T")
 
+_LOGGED = "logged"  # folder in `stages` for what `Context.ended` keeps
+
 _STAGE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*(?:/[A-Za-z0-9_][A-Za-z0-9_.\-]*)*")
-
-
-class MetricLog:
-    """`metrics.jsonl`: one sealed line per logged step, each passed to the watchers.
-
-    Lines hold no clock, and in the end those of a seed follow those of the seed before it: the file is the same, byte
-    for byte, whether or not the run was ever interrupted, and however many seeds were trained at a time.
-    """
-
-    def __init__(self, path: Path, watchers: Sequence[Watcher] = ()) -> None:
-        self._path, self._watchers, self._lock = path, watchers, threading.RLock()
-        self._seen: set[str] = set()
-        lines = _whole_lines(path)
-        write_text(path, "".join(lines))  # drops a line that a crash tore
-        self._file = path.open("a", encoding="utf-8")
-
-    def rewind(self, stage: str, step: int) -> None:
-        """Drop the lines of a stage at or past a step: they are about to be computed again."""
-        before = lambda row: row["stage"] != stage or row["step"] < step
-        with self._lock:
-            self._seen.add(stage)
-            lines = _whole_lines(self._path)
-            self._replace(lines, [line for line in lines if before(_row(line, self._path))])
-            for watcher in self._watchers:
-                watcher.rewound(stage, step)
-
-    def sort(self) -> None:
-        """Put the lines in the order of the seeds, which are the last part of the stages' names."""
-        with self._lock:
-            lines = _whole_lines(self._path)
-            self._replace(lines, sorted(lines, key=lambda line: _seed(_row(line, self._path)["stage"])))
-
-    def _replace(self, lines: list[str], by: list[str]) -> None:
-        if lines != by:
-            self._file.close()
-            write_text(self._path, "".join(by))
-            self._file = self._path.open("a", encoding="utf-8")
-
-    def append(self, stage: str, step: int, scalars: dict[str, Any]) -> None:
-        """Add one line and flush it; `ValueError` for a scalar that is not finite or takes the name of a field."""
-        taken = {"stage", "step", CHECKSUM} & set(scalars)
-        if taken:
-            raise ValueError(f"scalars holds {sorted(taken)}: these are fields of every line; rename them")
-        values = jsonable(scalars, where=f"{stage} step {step}")
-        with self._lock:
-            if stage not in self._seen:
-                self.rewind(stage, step)
-            self._file.write(seal(json.dumps({"stage": stage, "step": step, **values})) + "\n")
-            self._file.flush()
-            for watcher in self._watchers:
-                watcher.logged(stage, step, values)
-
-    def close(self) -> None:
-        """Flush the file to the disk and close it."""
-        if not self._file.closed:  # a signal may have come inside `rewind`
-            self._file.flush()
-            os.fsync(self._file.fileno())
-            self._file.close()
 
 
 class Context:
@@ -166,7 +106,24 @@ class Context:
         """Drop the logged lines of a stage at or past a step; needed only where the first new line may come later."""
         _checked(stage)
         if self._log is not None:
+            self._stage_file(f"{_LOGGED}/{stage}").unlink(missing_ok=True)
             self._log.rewind(stage, step)
+
+    def ended(self, stage: str) -> None:
+        """Keep the number and the checksum of the lines of a stage that has ended, for `require_log`."""
+        if self._log is not None:
+            write_sealed(self._stage_file(f"{_LOGGED}/{stage}"), {"lines": self._log.summary(stage)})
+
+    def require_log(self) -> None:
+        """`DamagedFileError` unless the log has the lines of all stages that have ended; no other look may be taken."""
+        folder = self.directory / "stages" / _LOGGED
+        if self._log is None:
+            return
+        for path in sorted(folder.rglob("*.json")):
+            stage, kept = path.relative_to(folder).with_suffix("").as_posix(), read_json(path)["lines"]
+            if self._log.summary(stage, kept[0]) != kept:
+                how = f"of the {kept[0]} lines of stage {stage} some are missing or changed"
+                raise damaged_log(self.directory / "metrics.jsonl", how)
 
     def sort_log(self) -> None:
         """Put the lines of the log in the order of the seeds, as if one had been trained after the other."""
@@ -251,7 +208,7 @@ class Context:
         missing = sorted(set(range(steps)) - seen)
         if missing:
             how = f"of stage {stage} {len(missing)} of {steps} steps are missing, the first is {missing[0]}"
-            raise _damaged(self.directory / "metrics.jsonl", how)
+            raise damaged_log(self.directory / "metrics.jsonl", how)
 
     def checkpoint_dir(self, stage: str) -> Path:
         """The directory of a stage's checkpoints, created."""
@@ -346,47 +303,6 @@ def _saved_result(path: Path) -> Any:
     """The result in the file of a stage; earlier versions wrote the result alone."""
     content = read_json(path)
     return content["result"] if isinstance(content, dict) and content.keys() == {"stage", "result"} else content
-
-
-def read_metrics(directory: Path) -> list[dict[str, Any]]:
-    """The logged lines of a run, in order."""
-    path = directory / "metrics.jsonl"
-    return [_row(line, path) for line in _whole_lines(path)]
-
-
-def _whole_lines(path: Path) -> list[str]:
-    if not path.exists():
-        return []
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-    except UnicodeDecodeError as error:
-        raise _damaged(path, str(error)) from error
-    if not lines or lines[-1].endswith("\n"):
-        return lines
-    torn = lines.pop()
-    for text in (torn, torn[:-1]):  # a whole line of which the last byte, its end, is lost or flipped
-        with contextlib.suppress(ValueError):
-            unseal(text)
-            return [*lines, f"{text}\n"]
-    return lines
-
-
-def _row(line: str, path: Path) -> dict[str, Any]:
-    try:
-        row: dict[str, Any] = unseal(line)
-    except ValueError as error:
-        raise _damaged(path, f"{error} in {line[:80]!r}") from error
-    return row
-
-
-def _damaged(path: Path, how: str) -> DamagedFileError:
-    return DamagedFileError(f"{path} is damaged ({how}): put a copy back, or start a new run with --fresh")
-
-
-def _seed(stage: str) -> int:
-    """The seed of a stage; −1 of one without, which comes before all seeds."""
-    last = stage.rpartition("/")[2]
-    return int(last) if last.isdecimal() else -1
 
 
 def _checked(stage: str) -> str:

@@ -80,13 +80,19 @@ def stage_hooks(
             sampled=None if describe is None else lambda t, sample: context.sampled(stage, t, describe(sample)),
         )
         bar.close()
-        if max(left_out):
-            context.print(f"{stage}: {max(left_out):.0f} updates were left out, for their gradient was not finite")
-        if times.steps:
-            context.add_time(f"{STEPPING}/{stage}", times.total_s)
-            context.add_time(f"{WAITING}/{stage}", times.input_s)
-            ms = 1e3 * times.total_s / times.steps
-            context.print(f"{stage}: {ms:.3g} ms a step, {times.input_share:.2%} of it {WAITING}")
+        _tell(context, stage, times, max(left_out))
+    context.ended(stage)
+
+
+def _tell(context: Context, stage: str, times: LoopTime, left_out: float) -> None:
+    """Keep and print how long the steps of a stage took, and say how many updates were left out."""
+    if left_out:
+        context.print(f"{stage}: {left_out:.0f} updates were left out, for their gradient was not finite")
+    if times.steps:
+        context.add_time(f"{STEPPING}/{stage}", times.total_s)
+        context.add_time(f"{WAITING}/{stage}", times.input_s)
+        ms = 1e3 * times.total_s / times.steps
+        context.print(f"{stage}: {ms:.3g} ms a step, {times.input_share:.2%} of it {WAITING}")
 
 
 def left_out_tables(lines: Iterable[Mapping[str, Any]]) -> tuple[Table, ...]:

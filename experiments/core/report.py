@@ -16,8 +16,8 @@ import numpy as np
 
 from experiments.core import curves
 from experiments.core.artifacts import write_bytes, write_text
-from experiments.core.context import read_metrics
 from experiments.core.look import marks
+from experiments.core.metric_log import read_metrics
 from experiments.core.results import Cell, Column, Comparison, Results, RolloutExample, Slot, Table
 from experiments.core.text import MEANINGLESS, SMOKE, bounds, number, plain, preset_in_words
 from touchr1_jax.bench.scoring import REPORTED

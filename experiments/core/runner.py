@@ -27,9 +27,10 @@ from rich.console import Console
 from experiments.core import numerics, runs, watchers
 from experiments.core.artifacts import DamagedFileError, jsonable, write_sealed
 from experiments.core.commands import PROG, find, print_error, print_lines, run_command
-from experiments.core.context import Context, read_metrics
+from experiments.core.context import Context
 from experiments.core.loops import left_out_tables
 from experiments.core.memory import require_memory
+from experiments.core.metric_log import read_metrics
 from experiments.core.remote_runs import run_at
 from experiments.core.report import write_report
 from experiments.core.results import Results
@@ -365,6 +366,7 @@ def _compute(
         events += [watchers.WeightsAndBiases(directory, description)] if command.wandb else []
         context = make_context(Console(emoji=False), [watchers.Latest(directory), page, *events])
         with contextlib.closing(context), context.timed("total"), page.kept_fresh():
+            context.require_log()
             results = experiment.run(command.config, context)
         tables = (*results.tables, *left_out_tables(read_metrics(directory)))
         timing, drawn = {**context.timing(), **results.timing}, {**experiment.curves, **results.curves}

@@ -264,7 +264,7 @@ def _object(path: Path, *lists: str) -> dict[str, Any]:
 def _in_use(directory: Path) -> bool:
     """True if a process works in a run directory; one that begins waits until this has checked."""
     lock = directory / ".lock"
-    if not lock.exists():
+    if not lock.is_file():
         return False
     with lock.open() as file:
         try:

@@ -6,6 +6,9 @@ from typing import Any
 
 INT32_MAX = 2**31 - 1  # of the whole numbers that arrays, seeds and sizes are made of
 
+LEAST_FLOAT, MOST_FLOAT = 1e-30, 1e15
+"""Numbers beyond them become 0 or infinite in the products of float32, in which everything is computed."""
+
 LARGER = 1000
 """A setting that may be above `INT32_MAX`, such as bytes, is at most so many times that of a scale."""
 
@@ -30,6 +33,10 @@ def require_sizes(config: Any, scales: Collection[Any]) -> None:
         least, most = min(known, default=None), max(INT32_MAX, LARGER * max(known, default=0))
         if any(isinstance(x, int) and x > most for x in numbers):
             raise ValueError(f"{path} is {value}: must be at most {most:.0f}; lower it")
+        if any(abs(x) > MOST_FLOAT for x in numbers):
+            raise ValueError(f"{path} is {value}: must be at most {MOST_FLOAT:g}; lower it")
+        if any(0 < abs(x) < LEAST_FLOAT for x in numbers):
+            raise ValueError(f"{path} is {value}: must be 0 or at least {LEAST_FLOAT:g}; raise it")
         if least is not None and least >= 0 and any(x < 0 for x in numbers):
             raise ValueError(f"{path} is {value}: must be at least 0; raise it")
         counts = isinstance(value, int) and least is not None and least >= 1 and not path.endswith("seed")

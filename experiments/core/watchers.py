@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from experiments.core.artifacts import read_json, write_text
-from experiments.core.context import read_metrics
 from experiments.core.curves import PhaseCurves, draw_phases
+from experiments.core.metric_log import read_metrics
 from experiments.core.progress import Loop, TrainingSample, Watcher
 from experiments.core.report import render
 from experiments.core.runs import continuing, point_latest

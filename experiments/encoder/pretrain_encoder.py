@@ -24,7 +24,8 @@ import numpy as np
 
 from experiments.core.artifacts import write_bytes
 from experiments.core.charts import Panel, Series, draw
-from experiments.core.context import Context, read_metrics
+from experiments.core.context import Context
+from experiments.core.metric_log import read_metrics
 from experiments.core.results import Cell, Picture, Results, Table, at_least, named_table
 from experiments.core.runner import Experiment
 from experiments.core.text import bounds, interval

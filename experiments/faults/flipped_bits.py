@@ -18,7 +18,8 @@ import jax
 import numpy as np
 
 from experiments.core.artifacts import DamagedFileError, read_json
-from experiments.core.context import Context, MetricLog, read_metrics
+from experiments.core.context import Context
+from experiments.core.metric_log import MetricLog, read_metrics
 from experiments.core.runs import read_description
 from experiments.faults.damaged_files import SAME as SAME_END
 from experiments.faults.damaged_files import Damage, end_of_run, telling_line

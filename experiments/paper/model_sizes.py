@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.core.charts import Panel, Series, draw, estimates
-from experiments.core.context import Context, read_metrics
+from experiments.core.context import Context
 from experiments.core.look import PALETTE, SHARED
 from experiments.core.loops import STEPPING
+from experiments.core.metric_log import read_metrics
 from experiments.core.results import Estimate, Table, named_table
 from experiments.core.text import bounds, number
 from experiments.paper.components import run_full_model

@@ -2,7 +2,8 @@
 
 from collections.abc import Callable
 
-from experiments.core.context import Context, read_metrics
+from experiments.core.context import Context
+from experiments.core.metric_log import read_metrics
 from touchr1_jax.rl.alarms import RULES, AlarmMonitor, AlarmRule
 from touchr1_jax.rl.scoring import NONFINITE_IN
 from touchr1_jax.training.loop import SKIPPED

@@ -19,7 +19,8 @@ from flax import traverse_util
 
 from experiments.core import numerics
 from experiments.core.artifacts import jsonable, write_arrays
-from experiments.core.context import Context, read_metrics
+from experiments.core.context import Context
+from experiments.core.metric_log import read_metrics
 from experiments.core.runs import ROOT, versions
 from sensors_io.arrays import load_arrays
 from touchr1_jax.types import Params
@@ -131,6 +132,7 @@ def _found(path: Path, context: Context, stage: str) -> Params:
         context.rewind(stage, 0)
         for line in lines:
             context.log(stage, **line)
+        context.ended(stage)
     return params
 
 

@@ -93,13 +93,13 @@ class Check:
 
 
 def _left_out(store: RecordStore) -> collections.Counter[str]:
-    """Counts of recordings that the import left out, by reason; empty for records that were not imported."""
-    report = store.meta.notes.get("report", {})
-    return collections.Counter(skip["reason"] for skip in report.get("skipped", ()))
+    """Counts of recordings that the import or `extract` left out, by reason."""
+    notes = [store.meta.notes.get(name, {}) for name in ("report", "fields")]
+    return collections.Counter(skip["reason"] for note in notes for skip in note.get("skipped", ()))
 
 
 def _counted(reasons: collections.Counter[str]) -> Table:
-    table = Table("left out when imported", "count")
+    table = Table("left out when imported or extracted", "count")
     for reason, count in reasons.most_common(_MOST_REASONS):
         table.add_row(reason, str(count))
     rest = len(reasons) - _MOST_REASONS

@@ -63,6 +63,12 @@ class Extract:
             raise CalibrationError(
                 f"{self.calibration} is for {calibration.sensor!r}, not {self.sensor!r}: must be equal; set --sensor"
             )
+        for records in (path for path in self.inputs if (path / INDEX).exists()):
+            if self.out.resolve().is_relative_to(records.resolve()):
+                raise SourceError(
+                    f"--out is {self.out}: lies in the folder of the records, which holds nothing else; name a path "
+                    "outside"
+                )
         if self.out.suffix == ".npz":
             return self._to_file(calibration)
         return self._to_records(calibration)
@@ -87,8 +93,10 @@ class Extract:
             rows=self.rows,
         )
         with progress_bar("contacts") as progress:
-            fields_beside(job, self.out, progress=progress, launcher=self.launcher)
+            skipped = fields_beside(job, self.out, progress=progress, launcher=self.launcher)
         OUT.print(overview.summary_table(RecordStore(self.out)))
+        if skipped:
+            OUT.print(overview.skip_table(skipped, "not extracted"))
         return 0
 
     def _to_file(self, calibration: Calibration | None) -> int:

@@ -12,7 +12,7 @@ import numpy as np
 from sensors_io.clock import NS_PER_S
 from sensors_io.devices import tac3d_messages
 from sensors_io.devices.base import Identity
-from sensors_io.devices.errors import DeviceNotFoundError
+from sensors_io.devices.errors import DeviceNotFoundError, StreamEndedError
 from sensors_io.errors import path_text
 from sensors_io.importers.pictures import PictureError, below, read_picture
 from sensors_io.records import RecordStore
@@ -103,6 +103,7 @@ class VideoFile:
         capture = self._open()
         try:
             count = 0
+            stated = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
             while capture.grab():
                 ok, image = capture.retrieve()
                 if not ok:
@@ -112,6 +113,11 @@ class VideoFile:
                 count += 1
         finally:
             capture.release()
+        if count < stated:
+            raise StreamEndedError(
+                f"{self.path} is cut off: {count} of {stated} frames could be decoded and were replayed; put a whole "
+                "copy back"
+            )
 
     def _open(self) -> cv2.VideoCapture:
         capture = cv2.VideoCapture(path_text(self.path))

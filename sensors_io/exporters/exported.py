@@ -22,8 +22,8 @@ def import_exported(path: pathlib.Path, out: pathlib.Path, progress: Progress) -
     """
     if not path.exists():
         raise ExportError(f"{path} does not exist: must be a folder or file that `export` wrote; correct the path")
-    if out.resolve() == path.resolve():
-        raise ExportError(f"--out is {out}, the export itself: must be another folder; name one")
+    if out.resolve().is_relative_to(path.resolve()):
+        raise ExportError(f"--out is {out}: is the export itself, or lies in it; name another folder")
     with contextlib.ExitStack() as stack:
         with damage_named(path):
             lerobot = (path / OURS).is_dir()

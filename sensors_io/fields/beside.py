@@ -6,12 +6,14 @@ import hashlib
 import json
 import pathlib
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from collections.abc import Sequence as Seq
 
 from sensors_io.contents import put_rest_pictures, rest_pictures
-from sensors_io.fields.extract import ExtractConfig, Extractor
+from sensors_io.fields.extract import ExtractConfig
 from sensors_io.fields.recorded import RecordedGels, RestGel, recorded_fields, with_fields
 from sensors_io.fields.types import Calibration, CalibrationError
+from sensors_io.importers.keep import Skip
 from sensors_io.index import RecordsMeta
 from sensors_io.parts import make_part, part_path, write_by_units
 from sensors_io.records import RecordStore
@@ -67,8 +69,10 @@ def fields_beside(
     progress: Callable[[int, int], None] = lambda done, total: None,
     frames_per_shard: int = FRAMES_PER_SHARD,
     launcher: Launcher = HERE,
-) -> None:
+) -> tuple[Skip, ...]:
     """Write records with the fields beside the pictures in `out`; contacts that are there already are kept.
+
+    A contact that cannot be read, such as one without a gel at rest, is left out and returned with the reason.
 
     Args:
       job: what is extracted.
@@ -78,81 +82,88 @@ def fields_beside(
       launcher: where shards are made; the records do not depend on it.
 
     Raises:
-      CalibrationError: no sequence of the sensor, `out` is where the records are, or the first sequence cannot be read.
+      CalibrationError: no sequence of the sensor, `out` is in the folder of the records, or no sequence can be read.
       RecordsExistError: `out` holds other records.
       LauncherError, UnitsError: as `units.finish`.
     """
     store = RecordStore(job.records)
-    if out.absolute() == job.records.absolute():
-        raise CalibrationError(f"--out is {out}: must not be the records themselves; name another directory")
-    _try_first(store, job)
+    if out.resolve().is_relative_to(job.records.resolve()):
+        raise CalibrationError(
+            f"--out is {out}: must not be the records themselves, nor lie in their folder; name another directory"
+        )
+    contacts, skipped = _readable_contacts(store, job)
     rests = rest_pictures(store.path)
+    fields = {"of": job.sensor, "records": store.digest, "rows": job.rows}
     meta = RecordsMeta(
         source=store.meta.source,
         licence=store.meta.licence,
         config_hash=job.hash(" ".join([store.digest, *(f"{name} {zlib.crc32(x)}" for name, x in rests.items())])),
         sensors=store.meta.sensors,
-        notes={**store.meta.notes, "fields": {"of": job.sensor, "records": store.digest, "rows": job.rows}},
+        notes={**store.meta.notes, "fields": fields | {"skipped": [dataclasses.asdict(skip) for skip in skipped]}},
     )
     each = max(1, round(sum(store.frames.values()) / max(len(store), 1)))
     per_shard = max(1, frames_per_shard // each)
 
-    def units_from(contacts: int, shards: int) -> list[WorkUnit]:
+    def units_from(done: int, shards: int) -> list[WorkUnit]:
         put_rest_pictures(out, rests)  # not before: `out` may hold other records
         units = []
-        for number, first in enumerate(range(contacts, len(store), per_shard), shards):
-            last = min(first + per_shard, len(store))
+        for number, first in enumerate(range(done, len(contacts), per_shard), shards):
+            last = min(first + per_shard, len(contacts))
             digest = hashlib.sha256(f"{meta.config_hash} {number} {first} {last}".encode()).hexdigest()[:16]
             name = f"{pathlib.Path(shard_file('contacts', number)).stem}.{digest}"
-            run = functools.partial(extract_shard, job, out.absolute(), number, first, last, name)
+            run = functools.partial(extract_shard, job, out.absolute(), number, contacts[first:last], name)
             units.append(WorkUnit(name=name, run=run, done=part_path(out.absolute(), name).exists))
         return units
 
     cards = store.objects.values()
-    write_by_units(out, meta, cards, units_from, launcher, lambda done: progress(done, len(store)))
+    write_by_units(out, meta, cards, units_from, launcher, lambda done: progress(done, len(contacts)))
+    return skipped
 
 
-def extract_shard(job: FieldsJob, out: pathlib.Path, number: int, first: int, last: int, name: str) -> None:
-    """Write the shard of the contacts from `first` on, before `last`, then the part that describes it."""
+def extract_shard(job: FieldsJob, out: pathlib.Path, number: int, contacts: Seq[int], name: str) -> None:
+    """Write the shard of some contacts, then the part that describes it."""
     store = RecordStore(job.records)
     gels = RecordedGels(store.path, job.gel, job.calibration, job.config)
-
-    def contacts() -> Iterator[list[Sequence]]:
-        for i in range(first, last):
-            yield [_extracted(sequence, job, gels) for sequence in store.contact(i).values()]
-
-    make_part(out, number, store.meta.sensors, contacts(), part_path(out, name))
+    made = ([_extracted(sequence, job, gels) for sequence in store.contact(i).values()] for i in contacts)
+    make_part(out, number, store.meta.sensors, made, part_path(out, name))
 
 
 def _extracted(sequence: Sequence, job: FieldsJob, gels: RecordedGels) -> Sequence:
     if sequence.sensor != job.sensor:
         return sequence
-    fields = recorded_fields(sequence, _readable(sequence, gels))
+    fields = recorded_fields(sequence, gels.extractor(sequence))
     return with_fields(sequence, fields, "" if job.calibration is None else job.calibration.hash, job.rows)
 
 
-def _readable(sequence: Sequence, gels: RecordedGels) -> Extractor:
-    have = [name for name in ("depth_mm", "deformation_mm", "shear_mm") if getattr(sequence, name) is not None]
-    if have:
-        raise CalibrationError(
-            f"{sequence.name} has {', '.join(have)} already: must have pictures alone; extract other records"
-        )
-    try:
-        return gels.extractor(sequence)
-    except CalibrationError as error:
-        raise CalibrationError(f"{sequence.name} cannot be read: {error}") from error
-
-
-def _try_first(store: RecordStore, job: FieldsJob) -> None:
-    """Refuse what cannot be read before anything is written."""
-    seen = (i for i in range(len(store)) if job.sensor in store.sensors_of(i))
-    first = next(seen, None)
-    if first is None:
+def _readable_contacts(store: RecordStore, job: FieldsJob) -> tuple[tuple[int, ...], tuple[Skip, ...]]:
+    """Numbers of the contacts that can be read, and those that cannot; refuses what no contact allows."""
+    seen = [i for i in range(len(store)) if job.sensor in store.sensors_of(i)]
+    if not seen:
         raise CalibrationError(
             f"--sensor is {job.sensor!r}: must be one of the records', {', '.join(store.meta.sensors)}; correct it"
         )
-    sequence = store.contact(first)[job.sensor]
     gels = RecordedGels(store.path, job.gel, job.calibration, job.config)
-    refused = _readable(sequence, gels).refused
+    unread: dict[int, Skip] = {}
+    first = None
+    for i in seen:
+        sequence = store.contact(i)[job.sensor]
+        try:
+            _require_readable(sequence, gels)
+        except CalibrationError as error:
+            unread[i] = Skip(name=sequence.name, reason=str(error))
+        else:
+            first = sequence if first is None else first
+    if first is None:
+        skip = unread[seen[0]]
+        raise CalibrationError(f"no contact can be read; the first, {skip.name}: {skip.reason}")
+    refused = gels.extractor(first).refused
     if job.calibration is None and len(refused) > 1:
-        raise CalibrationError(f"{sequence.name} carries no field: {'; '.join(refused)}")
+        raise CalibrationError(f"{first.name} carries no field: {'; '.join(refused)}")
+    return tuple(i for i in range(len(store)) if i not in unread), tuple(unread.values())
+
+
+def _require_readable(sequence: Sequence, gels: RecordedGels) -> None:
+    have = [name for name in ("depth_mm", "deformation_mm", "shear_mm") if getattr(sequence, name) is not None]
+    if have:
+        raise CalibrationError(f"has {', '.join(have)} already: must have pictures alone; extract other records")
+    gels.require(sequence)

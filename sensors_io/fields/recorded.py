@@ -1,6 +1,8 @@
 """Extraction of fields from recorded pictures: the gel at rest, the size and the pitch are those of each recording."""
 
+import contextlib
 import dataclasses
+from collections.abc import Iterator
 from typing import Any
 
 import cv2
@@ -55,6 +57,7 @@ class RecordedGels:
     ):
         self._root, self._gel, self._calibration, self._config = root, gel, calibration, config
         self._extractors: dict[tuple[str, float, tuple[int, ...]], Extractor] = {}
+        self._rests: dict[tuple[str, tuple[int, ...]], np.ndarray] = {}
 
     def extractor(self, sequence: Sequence) -> Extractor:
         """The extractor of a sequence.
@@ -63,12 +66,22 @@ class RecordedGels:
           CalibrationError: no pictures; no gel at rest, none of this shape, or one that cannot be read; no pitch; a
             calibration of another window.
         """
-        try:
-            return self._made(sequence)
-        except (SchemaError, SourceError) as error:
-            raise CalibrationError(str(error)) from error
+        with _named():
+            rest, pitch, calibration = self._known(sequence)
+            if not background_file(sequence) and self._gel.rest_frames:
+                return Extractor(rest, pitch, calibration, self._config)
+            key = background_file(sequence), pitch, rest.shape
+            if key not in self._extractors:
+                self._extractors[key] = Extractor(rest, pitch, calibration, self._config)
+            return self._extractors[key]
 
-    def _made(self, sequence: Sequence) -> Extractor:
+    def require(self, sequence: Sequence) -> None:
+        """Refuse what `extractor` refuses without making one, which takes seconds for a gel with markers."""
+        with _named():
+            self._known(sequence)
+
+    def _known(self, sequence: Sequence) -> tuple[np.ndarray, float, Calibration | None]:
+        """The gel at rest, the pitch, and the calibration at the size of the pictures."""
         if sequence.frames is None:
             raise CalibrationError("they hold no pictures")
         shape = sequence.frames.shape[1:]
@@ -77,16 +90,7 @@ class RecordedGels:
             calibration.require_sensor(sequence.sensor)
         if calibration is not None and calibration.background.shape != shape:
             calibration = calibration.at_size((shape[0], shape[1]))
-        pitch = self._pitch(sequence, calibration)
-        name = background_file(sequence)
-        own = not name and self._gel.rest_frames > 0
-        known = None if own else self._extractors.get((name, pitch, shape))
-        if known is not None:
-            return known
-        made = Extractor(self._rest(sequence, name), pitch, calibration, self._config)
-        if not own:
-            self._extractors[name, pitch, shape] = made
-        return made
+        return self._rest(sequence, background_file(sequence)), self._pitch(sequence, calibration), calibration
 
     def _pitch(self, sequence: Sequence, calibration: Calibration | None) -> float:
         pitch = self._gel.mm_per_px if sequence.mm_per_px is None else sequence.mm_per_px
@@ -95,6 +99,8 @@ class RecordedGels:
                 raise CalibrationError(
                     "nothing tells their mm per px: give --mm-per-px or --calibration, or import and record with it"
                 )
+            if not 0 < pitch < 1:
+                raise CalibrationError(f"mm_per_px is {pitch}: must lie in (0, 1); give --mm-per-px or --calibration")
             return pitch
         if pitch is not None and abs(pitch / calibration.mm_per_px - 1) > _SAME_PITCH:
             raise CalibrationError(
@@ -108,16 +114,27 @@ class RecordedGels:
         if not name and self._gel.rest_frames:
             count = min(self._gel.rest_frames, len(sequence))
             return np.rint(sequence.frames[:count].mean(0)).astype(np.uint8)
+        shape = sequence.frames.shape[1:]
+        if (name, shape) in self._rests:
+            return self._rests[name, shape]
         rest = read_picture(local(self._root, name)) if name else self._gel.background
         if rest is None:
             raise CalibrationError("no gel at rest was recorded with them: give --background or --rest-frames")
-        rest = at_height(rest, sequence.frames.shape[1])
-        if rest.shape != sequence.frames.shape[1:]:
+        rest = at_height(rest, shape[0])
+        if rest.shape != shape:
             raise CalibrationError(
-                f"their pictures are {sequence.frames.shape[1:3]}, the gel at rest is {rest.shape[:2]} at their "
-                "height: crop them alike"
+                f"their pictures are {shape[:2]}, the gel at rest is {rest.shape[:2]} at their height: crop them alike"
             )
+        self._rests[name, shape] = rest
         return rest
+
+
+@contextlib.contextmanager
+def _named() -> Iterator[None]:
+    try:
+        yield
+    except (SchemaError, SourceError) as error:
+        raise CalibrationError(str(error)) from error
 
 
 def recorded_fields(sequence: Sequence, extractor: Extractor) -> Fields:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sensors_io.clock import NS_PER_S
-from sensors_io.codec import FIELDS, WIDEST
+from sensors_io.codec import FIELDS, LARGEST
 from sensors_io.errors import MALFORMED, UserError
 from sensors_io.force import ForceError, at_frames
 from sensors_io.recording.journal import JournalEntry, JournalError, read_journal
@@ -180,15 +180,15 @@ def _alike(frames: Seq[JournalEntry]) -> Seq[JournalEntry]:
 
 
 def _mend(arrays: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Put 0 where a value is not finite, or a field too large for the records; fields are not `valid` there.
+    """Put 0 where a value is not finite, or too large for the records; fields are not `valid` there.
 
     Returns:
       Array → rows that held such a value, bool [N]; an array without any is left out.
     """
     broken = {}
-    for name in [name for name in arrays if name in WIDEST]:
+    for name in [name for name in arrays if name in LARGEST]:
         value = arrays[name]
-        good = np.isfinite(value) & ((name not in FIELDS) | (np.abs(value) <= WIDEST[name]))
+        good = np.isfinite(value) & (np.abs(value) <= LARGEST[name])
         if good.all():
             continue
         arrays[name] = np.where(good, value, np.float32(0))

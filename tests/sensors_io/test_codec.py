@@ -85,7 +85,7 @@ def test_the_largest_range_is_carried_and_the_next_is_refused(name):
     counts, scale = codec.quantise(name, np.array([-limit], np.float32), where="here")
     assert counts[0] == -32767
     assert scale / 2 <= codec.TOLERANCE[name]
-    with pytest.raises(SchemaError, match=f"here: {name} reaches .* int16 carries at most"):
+    with pytest.raises(SchemaError, match=f"here: {name} reaches .* records hold at most"):
         codec.quantise(name, np.array([limit * 1.001], np.float32), where="here")
 
 

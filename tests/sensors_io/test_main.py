@@ -144,6 +144,9 @@ NO_DIRECTORY = [[*name.split(), "nowhere"] for name in (*LAYOUTS.split(), "vtv15
             "ValueError: out is same: ",
         ),
         (2, ["extract", "same", *EXTRACT[2:-1], "same"], "ValueError: out is same: is inputs as well"),
+        (2, ["import", "tvl", "t", "--out", ""], "ValueError: --out is '': must not be empty; give its value"),
+        (2, ["import", "tvl", "t", "--out="], "ValueError: --out is '': must not be empty; give its value"),
+        (2, ["check", ""], "ValueError: an argument is '': must not be empty; give its value"),
     ],
 )
 def test_known_errors_are_one_line(run, tmp_path, monkeypatch, status, args, message):

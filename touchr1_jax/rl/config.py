@@ -363,7 +363,7 @@ class GRPOConfig:
                 f"best_of is {best_of}: must be at most group {self.group}, and 1 for advantage PER_REWARD and for "
                 "segment_credit, which have no total to take the best of; lower it"
             )
-        if list(self.buckets) != sorted({*self.buckets} & set(range(2, self.length))):
+        if list(self.buckets) != sorted({n for n in self.buckets if 2 <= n < self.length}):
             raise ValueError(f"buckets is {self.buckets}: must ascend within 2 … {self.length - 1}; sort it")
 
     @property

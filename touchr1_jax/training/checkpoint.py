@@ -64,8 +64,9 @@ class Restored(NamedTuple):
 
 
 def _not_of_a_failed_save(record: logging.LogRecord) -> bool:
-    """False of what threads of a save log of their failure, tracebacks of pages: the save raises it in one line."""
-    return record.levelno < logging.ERROR or "/orbax/" not in record.pathname
+    """False of what a save logs of its failure, which it raises in one line, and of a score that it lacks at a stop."""
+    quiet = record.levelno < logging.ERROR and "tracked_metric" not in str(record.msg)
+    return quiet or "/orbax/" not in record.pathname
 
 
 logging.getLogger("absl").addFilter(_not_of_a_failed_save)

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from experiments.core.artifacts import DamagedFileError, jsonable
-from experiments.core.context import MetricLog, read_metrics
+from experiments.core.artifacts import DamagedFileError, UnwrittenError, jsonable
+from experiments.core.metric_log import MetricLog, read_metrics
 from experiments.core.progress import Loop, show_progress
+from experiments.faults.fixtures import full_disk
+from tests.sensors_io.checks import refused
 
 
 def log_steps(path, stage, steps):
@@ -61,6 +63,64 @@ def test_every_flipped_bit_of_a_log_is_named_or_harmless(tmp_path):
         with contextlib.suppress(DamagedFileError):
             MetricLog(path).close()
             assert read_metrics(tmp_path) == rows, bit
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "7", "[]", "null", "{}", '{"stage": "sft/0"}', '{"stage": 3, "step": 1}', '{"stage": "sft/0", "step": "1"}',
+        '{"stage": "sft/0", "step": true}', '{"stage": "sft/0", "step": 1, "loss": NaN}', "\ufeff{}", "",
+        '{"stage": "sft/0", "step": 1, "loss": 1e999}', '{"stage": "sft/0", "step": 1, "loss": 1%s}' % ("0" * 400),
+        '{"stage": "sft/0", "step": 0, "loss": 0.1}',
+        '{"stage": "sft/0", "step": 9, "loss": 0.1}\n{"stage": "sft/0", "step": 9, "loss": 0.1}',
+    ],
+)  # fmt: skip
+def test_a_foreign_line_is_named_before_anything_is_trained(tmp_path, line):
+    path = tmp_path / "metrics.jsonl"
+    log_steps(path, "sft/0", range(2))
+    content = path.read_text() + line + "\n"
+    path.write_text(content)
+    for read in (MetricLog, lambda path: read_metrics(path.parent)):
+        with pytest.raises(DamagedFileError, match=r"metrics\.jsonl is damaged \(.*: put a copy back"):
+            read(path)
+    assert path.read_text() == content
+
+
+@pytest.mark.parametrize("kept", [[], [0, 2, 3], [0, 1], [0, 1, 1, 2, 3], [0, 2, 1, 3]])
+def test_lines_of_a_stage_that_has_ended_are_missed(context, kept):
+    for step in range(3):
+        context.log("sft/0", step, loss=1 / (1 + step))
+    context.ended("sft/0")
+    context.log("sft/0", 3, probe=0.5)
+    context.require_log()
+    path = context.directory / "metrics.jsonl"
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(lines[n] for n in kept))
+    with pytest.raises(DamagedFileError, match="of the 3 lines of stage sft/0 some are missing or changed"):
+        context.require_log()
+    context.rewind("sft/0", 2)
+    context.require_log()
+
+
+def test_a_log_on_a_full_disk_is_named_and_goes_on(tmp_path):
+    log_steps(tmp_path / "whole.jsonl", "sft/0", range(9))
+    path = tmp_path / "metrics.jsonl"
+    said = r"metrics\.jsonl cannot be written \(.*\): free some space, then continue"
+    with full_disk(tmp_path, 200):
+        log = MetricLog(path)
+        write = lambda: [log.append("sft/0", step, {"loss": 1 / (1 + step)}) for step in range(9)]
+        refused(UnwrittenError, said, write)
+        refused(UnwrittenError, said, log.close)
+    log.close()
+    log_steps(path, "sft/0", range(len(read_metrics(tmp_path)), 9))
+    assert path.read_bytes() == (tmp_path / "whole.jsonl").read_bytes()
+
+
+def test_other_ends_of_lines_are_read(tmp_path):
+    log_steps(tmp_path / "metrics.jsonl", "sft/0", range(2))
+    rows = read_metrics(tmp_path)
+    (tmp_path / "metrics.jsonl").write_bytes((tmp_path / "metrics.jsonl").read_bytes().replace(b"\n", b"\r\n"))
+    assert read_metrics(tmp_path) == rows
 
 
 @pytest.mark.parametrize("stage", ["", "/sft", "sft/", "../sft", "sft/..", "a b", "sft//0"])

@@ -96,15 +96,19 @@ def test_damage_is_reported_and_costs_the_steps_since(whole, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("kept", [0, 5], ids=["emptied", "cut"])
-def test_no_run_ends_with_a_part_of_its_log(whole, tmp_path, capsys, kept):
+@pytest.mark.parametrize("ended", [True, False])
+def test_no_run_ends_with_a_part_of_its_log(whole, tmp_path, capsys, kept, ended):
     shutil.copytree(whole, tmp_path, symlinks=True, dirs_exist_ok=True)
     directory = run_directory(tmp_path)
     (directory / "results.json").unlink()
+    if not ended:
+        (directory / "stages" / "logged" / "count" / "0.json").unlink()
     log = directory / "metrics.jsonl"
     log.write_text("".join(log.read_text().splitlines(keepends=True)[:kept]))
     assert run_counting(tmp_path) != 0
     error = capsys.readouterr().err
-    assert f"of stage count/0 {12 - kept} of 12 steps are missing, the first is {kept}" in error
+    said = f"of stage count/0 {12 - kept} of 12 steps are missing, the first is {kept}"
+    assert ("of the 12 lines of stage count/0 some are missing or changed" if ended else said) in error
     assert "put a copy back, or start a new run with --fresh" in error
     assert not (directory / "results.json").exists()
 

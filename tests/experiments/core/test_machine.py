@@ -13,7 +13,8 @@ import pytest
 from jax.experimental import multihost_utils
 from rich.console import Console
 
-from experiments.core.context import Context, read_metrics
+from experiments.core.context import Context
+from experiments.core.metric_log import read_metrics
 from experiments.core.runner import Experiment, run_experiment
 from tests.experiments.fakes import coin
 from touchr1_jax.distributed.processes import (

@@ -2,12 +2,15 @@
 
 import fcntl
 import json
+import os
+import re
 import subprocess
 import sys
 import threading
 
 import pytest
 
+from experiments.__main__ import main as start
 from experiments.core import runs
 from experiments.core.artifacts import DamagedFileError, UnwrittenError, write_json
 from experiments.core.runner import main
@@ -116,6 +119,16 @@ def test_a_damaged_run_hides_no_other(tmp_path, capsys):
         assert "20260103-000000/config.json is not that of a run" in out
 
 
+@pytest.mark.parametrize("file", ["config.json", "results.json", "timing.json", ".lock"])
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
+def test_no_command_waits_at_a_pipe(tmp_path, capsys, file, make):
+    place = make_run(tmp_path, "20260101-000000", results=FINISHED, total=2) / file
+    place.unlink(missing_ok=True)
+    make(place)
+    assert main(["list", "coin", "--runs-dir", str(tmp_path)], package=FAKES) == 0
+    assert (f"{file} is damaged (it is a folder, a pipe" in capsys.readouterr().out) == (file != ".lock")
+
+
 @pytest.mark.parametrize(
     ("file", "content"),
     [
@@ -169,3 +182,14 @@ def test_an_experiment_without_runs_and_an_unknown_one_are_named(tmp_path, capsy
     for wrong in (str(tmp_path / "file"), str(tmp_path / "nowhere"), "s3://bucket/runs"):
         assert main(["list", "--runs-dir", wrong], package=FAKES) == 2
         assert "must be a folder of this machine" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["sweep", "ablation_ordinal", "--into", ""], ["list", "--runs-dir="], ["list", ""]])
+def test_an_empty_word_is_not_the_current_folder(monkeypatch, capsys, words):
+    monkeypatch.setattr(sys, "argv", ["experiments", *words])
+    with pytest.raises(SystemExit) as stop:
+        start()
+    assert stop.value.code == 2
+    assert re.fullmatch(
+        r"ValueError: (--into|--runs-dir|an argument) is '': must not be empty; .*\n", capsys.readouterr().err
+    )

@@ -49,6 +49,9 @@ SCALES = (Config(), Config(training=Training(shift=-1.0), moments=0))
         ({"rate": -0.1}, "training.rate is -0.1: must be at least 0; raise it"),
         ({"forces": (1.0, -5.0)}, r"training.forces is \(1.0, -5.0\): must be at least 0; raise it"),
         ({"steps": 10**21}, "training.steps is 1000000000000000000000: must be at most 2147483647; lower it"),
+        ({"rate": 1e300}, r"training.rate is 1e\+300: must be at most 1e\+15; lower it"),
+        ({"shift": -1e16}, r"training.shift is -1e\+16: must be at most 1e\+15; lower it"),
+        ({"forces": (1.0, 1e-300)}, r"training.forces is .*: must be 0 or at least 1e-30; raise it"),
         ({"first_seed": -1}, "training.first_seed is -1: must be at least 0; raise it"),
     ],
 )

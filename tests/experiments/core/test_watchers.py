@@ -12,7 +12,8 @@ import pytest
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 
 from experiments.core import watchers
-from experiments.core.context import Context, MetricLog
+from experiments.core.context import Context
+from experiments.core.metric_log import MetricLog
 from experiments.core.progress import TrainingSample
 from experiments.core.runner import main
 from experiments.core.stopping import Stopped

@@ -9,7 +9,8 @@ import pytest
 from rich.console import Console
 
 from experiments.core.artifacts import read_json
-from experiments.core.context import Context, read_metrics
+from experiments.core.context import Context
+from experiments.core.metric_log import read_metrics
 from experiments.encoder import pretrain_encoder
 from experiments.encoder.pretrain import StageOneDataConfig, held_out_contacts, pretrain
 from experiments.study.seed import StudySeed

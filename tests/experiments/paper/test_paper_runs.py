@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import pytest
 
 from experiments.core.artifacts import read_json
-from experiments.core.context import read_metrics
 from experiments.core.loops import STEPPING, WAITING
+from experiments.core.metric_log import read_metrics
 from experiments.paper import ablation_ordinal, presets
 from experiments.study.ablation import ablation_experiment
 from experiments.study.policies import find_policy

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from experiments.core.context import Context, read_metrics
+from experiments.core.context import Context
 from experiments.core.loops import stage_hooks
+from experiments.core.metric_log import read_metrics
 from experiments.recordings.descriptions import AuxiliaryData, DescribedVideos
 from experiments.recordings.learning import LearnConfig, answer_log_probs, learn, load, save
 from experiments.recordings.level_probes import BY_ATTRIBUTE, LevelProbeConfig, ProbedVideos

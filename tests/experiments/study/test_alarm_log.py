@@ -5,7 +5,8 @@ import io
 import pytest
 from rich.console import Console
 
-from experiments.core.context import Context, read_metrics
+from experiments.core.context import Context
+from experiments.core.metric_log import read_metrics
 from experiments.study.alarm_log import ALARM, alarm_log
 from tests.touchr1_jax.rl.test_active_alarms import HEALTHY
 from touchr1_jax.rl.active_alarms import ACTIVE_RULES

@@ -9,8 +9,9 @@ import pytest
 
 from experiments.core import runs
 from experiments.core.artifacts import read_json
-from experiments.core.context import Context, read_metrics
+from experiments.core.context import Context
 from experiments.core.errors import DataError
+from experiments.core.metric_log import read_metrics
 from experiments.core.runner import main
 from experiments.study.study import StudyPart, train_parts
 from sensors_io.units import UnitsError

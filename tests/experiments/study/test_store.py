@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from experiments.core.artifacts import read_json
-from experiments.core.context import Context, read_metrics
+from experiments.core.context import Context
+from experiments.core.metric_log import read_metrics
 from experiments.study.dataset import open_dataset
 from experiments.study.seed import StudySeed
 from experiments.study.stages import StudySFT

@@ -13,7 +13,7 @@ from sensors_io.devices.sources import RecordedContact
 from sensors_io.scenes.config import SceneConfig
 from tests.sensors_io import fakes as records
 from tests.sensors_io.checks import refused
-from tests.sensors_io.importers.films import cut, picture
+from tests.sensors_io.importers.films import cut, film, picture
 
 
 def everything(device):
@@ -80,6 +80,14 @@ def test_faults_are_checked():
     refused(ValueError, "jitter_s is -1.0", Faults, jitter_s=-1.0)
     overlapping = Disconnect(at_s=5, for_s=2), Disconnect(at_s=6, for_s=1)
     refused(ValueError, "ascending and apart", Faults, disconnects=overlapping)
+
+
+@pytest.mark.parametrize("seconds", [0, 60])
+def test_a_video_that_is_cut_off_does_not_end_as_a_whole_one(tmp_path, seconds):
+    path = cut(film(tmp_path / "a.avi", 40))
+    with ReplayConfig(path=path, seconds=seconds).open(JumpingClock()) as device:
+        read_all = lambda: [device.read(10.0) for _ in range(41)]
+        refused(StreamEndedError, r"is cut off: \d+ of 40 frames could be decoded", read_all)
 
 
 def test_a_video_at_its_own_rate(tmp_path):

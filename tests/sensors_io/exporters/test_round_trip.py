@@ -176,7 +176,8 @@ def test_what_cannot_be_exported_or_read_is_one_line(tmp_path, monkeypatch):
     refused(ExportError, r"contacts is \[0, 0\]: must name each contact once", Selected, store=store, rows=(0, 0))
     read = functools.partial(import_exported, out=tmp_path / "back", progress=SILENT)
     refused(ExportError, "does not exist", read, tmp_path / "gone")
-    refused(ExportError, "the export itself", import_exported, records, records, SILENT)
+    for out in (records, records / "inside"):
+        refused(ExportError, "is the export itself, or lies in it", import_exported, records, out, SILENT)
     pytest.importorskip("h5py")
     export("hdf5", records, tmp_path / "a.h5")
     refused(ExportError, "must not exist yet", export, "hdf5", records, tmp_path / "a.h5")

@@ -104,6 +104,21 @@ def test_the_gel_at_rest_of_other_records_stays(tmp_path):
     assert rest_pictures(tmp_path / "out") == {"rest.png": b"a picture"}
 
 
+def test_a_contact_without_a_gel_at_rest_costs_no_other(tmp_path):
+    lost = {"camera": {"recording": {"background": "gone.png"}}}
+    with RecordWriter(tmp_path / "records", meta=fakes.META) as writer:
+        writer.write_object(fakes.card(0))
+        for trial in range(4):
+            writer.write_contact([recorded(trial=trial, **(lost if trial in (0, 2) else {}))])
+    skipped = fields_beside(job(tmp_path / "records"), tmp_path / "out", frames_per_shard=3)
+    store = RecordStore(tmp_path / "out")
+    assert [store.contact(i)["gelsight_mini"].key.trial for i in range(len(store))] == [1, 3]
+    assert [skip.name for skip in skipped] == [f"object_0/0/press/{trial}/gelsight_mini" for trial in (0, 2)]
+    assert "gone.png is absent" in skipped[0].reason
+    assert store.meta.notes["fields"]["skipped"] == [dataclasses.asdict(skip) for skip in skipped]
+    assert fields_beside(job(tmp_path / "records"), tmp_path / "out", frames_per_shard=3) == skipped
+
+
 @pytest.mark.parametrize("when", ["before a part", "after a part"])
 def test_an_extraction_that_was_killed_goes_on(tmp_path, monkeypatch, when):
     records = written(tmp_path / "records", 4)
@@ -134,7 +149,8 @@ def test_what_cannot_be_extracted_is_one_line(tmp_path):
     records, out = written(tmp_path / "records", 1), tmp_path / "out"
     extract = functools.partial(fields_beside, out=out)
     refused(CalibrationError, "no gel at rest was recorded", extract, job(records, gel=RestGel()))
-    refused(CalibrationError, "must not be the records", fields_beside, job(records), records)
+    for inside in (records, records / "fields"):
+        refused(CalibrationError, "must not be the records", fields_beside, job(records), inside)
     refused(CalibrationError, "--sensor is 'tac3d'", extract, job(records, sensor="tac3d", calibration=None))
     refused(CalibrationError, "carries no field", extract, job(records, calibration=None))
     refused(CalibrationError, "rows is -1", job, records, rows=-1)

@@ -65,9 +65,13 @@ def test_what_is_left_out_is_reported(tmp_path):
     assert set(store.objects) == {"object_0", "object_1"}
 
 
-def test_a_contact_that_no_record_can_hold_costs_no_other(tmp_path):
+@pytest.mark.parametrize(
+    ("name", "value", "most"), [("depth_mm", 40, "31.999"), ("force_n", 1e30, "1e+06"), ("moment_nmm", -1e30, "1e+09")]
+)
+def test_a_contact_that_no_record_can_hold_costs_no_other(tmp_path, name, value, most):
     def read():
-        return Taken(sequences=(fakes.sequence(0, depth_mm=np.full((12, 5, 6), 40, np.float32)),))
+        shape = (12, 5, 6) if name == "depth_mm" else (12, 3)
+        return Taken(sequences=(fakes.sequence(0, **{name: np.full(shape, value, np.float32)}),))
 
     key = ContactKey(object_id="object_3", site=0, motion="free", trial=0)
     listing = catalogue()
@@ -75,7 +79,8 @@ def test_a_contact_that_no_record_can_hold_costs_no_other(tmp_path):
     cards = {**listing.cards, "object_3": fakes.card(3)}
     report, store = imported(dataclasses.replace(listing, cards=cards, contacts=(broken, *listing.contacts)), tmp_path)
     assert (report.contacts, set(store.objects)) == (8, {"object_0", "object_1", "object_2"})
-    assert "depth_mm reaches 40: int16 carries at most" in {s.name: s.reason for s in report.skipped}["deep"]
+    reason = {s.name: s.reason for s in report.skipped}["deep"]
+    assert f"{name} reaches {abs(value):g}: records hold at most {most}; check the unit" in reason
 
 
 @pytest.mark.parametrize("stop", [1, 2, 5, 6, 7, 9])

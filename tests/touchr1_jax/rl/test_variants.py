@@ -1,6 +1,7 @@
 """Whole steps under other algorithms and options: what each must change, and what none may."""
 
 import dataclasses
+import tracemalloc
 
 import jax
 import jax.numpy as jnp
@@ -149,6 +150,13 @@ def test_buckets_change_nothing_but_the_time(buckets):
 def test_buckets_must_ascend_below_the_length():
     with pytest.raises(ValueError, match=r"buckets is \(6, 3\): must ascend"):
         of(Paper(), buckets=(6, 3))
+
+
+def test_a_length_is_checked_without_its_memory():
+    tracemalloc.start()
+    of(Paper(), length=2**20, buckets=(3, 6))
+    assert tracemalloc.get_traced_memory()[1] < 2**20
+    tracemalloc.stop()
 
 
 @pytest.mark.long

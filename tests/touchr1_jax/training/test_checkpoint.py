@@ -299,10 +299,14 @@ def test_at_least_one_is_kept(tmp_path):
 
 
 def test_a_failed_save_is_told_once(tmp_path, caplog):
-    """Threads of Orbax log tracebacks of the failure that `Checkpoints` raises; other errors pass."""
-    where = Path(ocp.__file__).parent / "x.py"
-    for name, path, told in (("absl", where, False), ("absl", tmp_path / "x.py", True), ("orbax", where, True)):
-        logger = logging.getLogger(name)
-        logger.handle(logger.makeRecord(name, logging.ERROR, str(path), 1, "no space", (), None))
-        assert ("no space" in caplog.text) == told
+    """Threads of Orbax log tracebacks of the failure that `Checkpoints` raises; other errors pass.
+
+    So does no word that a save at a signal lacks a score.
+    """
+    where, score = Path(ocp.__file__).parent / "x.py", "Requested `tracked_metric`; did not provide metrics."
+    said = [("absl", where, "no space", False), ("absl", tmp_path / "x.py", "no space", True)]
+    for name, path, text, told in (*said, ("orbax", where, "no space", True), ("absl", where, score, False)):
+        logger, level = logging.getLogger(name), logging.WARNING if text == score else logging.ERROR
+        logger.handle(logger.makeRecord(name, level, str(path), 1, text, (), None))
+        assert (text in caplog.text) == told
         caplog.clear()
