@@ -93,10 +93,13 @@ class SceneConfig:
         require(0 <= self.visual_lie_share <= 1, "visual_lie_share", self.visual_lie_share, "must lie in [0, 1]")
         ok = 0 < self.min_force_n <= self.max_force_n
         require(ok, "min_force_n", self.min_force_n, f"must lie in (0, max_force_n = {self.max_force_n}]")
+        require(self.max_force_n <= 1e4, "max_force_n", self.max_force_n, "must be ≤ 10⁴")
         require(0 <= self.force_jitter <= 0.1, "force_jitter", self.force_jitter, "must lie in [0, 0.1]")
         require(0 <= self.force_gain_error <= 1, "force_gain_error", self.force_gain_error, "must lie in [0, 1]")
-        require(self.force_noise_n >= 0, "force_noise_n", self.force_noise_n, "must be ≥ 0")
-        require(self.ramp_s > 0, "ramp_s", self.ramp_s, "must be > 0")
+        require(0 <= self.force_noise_n <= 1e4, "force_noise_n", self.force_noise_n, "must lie in [0, 10⁴]")
+        require(
+            1e-3 <= self.ramp_s <= 1e6, "ramp_s", self.ramp_s, "must lie in [0.001, 10⁶], for times in 64 bits of ns"
+        )
         require(self.adhesion_j_per_m2 >= 0, "adhesion_j_per_m2", self.adhesion_j_per_m2, "must be ≥ 0")
         require(self.adhesion_tolerance > 0, "adhesion_tolerance", self.adhesion_tolerance, "must be > 0")
         for name in ("part_share", "graded_share"):
