@@ -60,6 +60,8 @@ NO_FAILURE = {
     "every touch, and time is free": {"all_actions_share": 1.0, "reward_seconds": 0.0},
     "one question": {"first_kind_information": 0.0, "questions": 1.0},
     "one kind of touch": {"first_kind_information": 0.0, "kinds": 1.0},
+    "one touch tells of the question": {"first_kind_information": 0.15},
+    "half touch nothing": {"first_kind_information": 0.0, "no_action_share": 0.5},
     "touches at random": {"first_kind_information": 0.0, "first_kind_peak": 0.3},
 }
 
