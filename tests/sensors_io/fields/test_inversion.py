@@ -107,6 +107,14 @@ def test_nothing_touches_nothing_acts(inverse):
     assert not found.traction_mpa.any()
 
 
+def test_loads_without_smoothness_know_nothing_of_each_other(noisy):
+    """ℓ of 0 is its limit."""
+    grid, part = dataclasses.replace(GRID, shape=(6, 8)), noisy[:6, :8]
+    none, least = (LayerInverse(GEL, grid, dataclasses.replace(CONFIG, smooth_mm=mm)) for mm in (0.0, 1e-3))
+    found, expected = (x.linear(part[..., :2], part[..., 2]).traction_mpa for x in (none, least))
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
 def test_magnification_is_undone(noisy):
     y, x = np.mgrid[:SIDE, :SIDE] - (SIDE - 1) / 2
     seen = noisy[..., :2] + noisy[..., 2:] / 25.0 * np.stack([x, y], -1)

@@ -31,6 +31,13 @@ def test_scatter_is_the_quartile_range_of_the_gaps_over_their_median():
     assert found.spread == len({(4 * x // 260, 4 * y // 240) for x, y in points}) / 16
 
 
+def test_dots_that_touch_count_once():
+    """The maxima of two, of 4 px radius and 7 px apart, lie within 2 σ of each other."""
+    points = gels.lattice(24)
+    touching = np.append(points, [points[10] + [7, 0]], 0)
+    assert len(find_markers(gels.dots(touching))) == len(points)
+
+
 def test_contrast_is_that_of_the_dots():
     assert find_markers(gels.dots(gels.lattice(24), 5.0, contrast=60.0)).contrast == pytest.approx(60, rel=0.15)
 

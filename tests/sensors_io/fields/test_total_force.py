@@ -60,4 +60,5 @@ def test_what_cannot_be_fitted_is_refused():
     refused(ForceFitError, "blocks is 2", fit, FIELDS, FORCE, blocks=2)
     refused(ForceFitError, "record more", fit, FIELDS[:30], FORCE[:30], blocks=5)
     refused(ForceFitError, "drop incomplete", fit, FIELDS, np.full_like(FORCE, np.nan), blocks=5)
-    refused(ForceFitError, "press while recording", fit, FIELDS, np.ones_like(FORCE), blocks=5)
+    refused(ForceFitError, "press while recording", fit, FIELDS, 0 * FORCE + [1, 2, 3], blocks=5)
+    refused(ForceFitError, "press while recording", fit, 0 * FIELDS + FIELDS[0], FORCE, blocks=5)

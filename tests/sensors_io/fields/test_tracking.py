@@ -59,14 +59,24 @@ def test_lost_dots_are_flagged_placed_and_found_again(tracker):
     assert follow(peak, tracker).found.all()
 
 
+@pytest.mark.parametrize(("px", "believed"), [(3.0, True), (5.0, False)])
+def test_a_dot_that_moves_alone_by_a_fifth_of_a_pitch_is_not_believed(tracker, px, believed):
+    points, alone = POINTS.copy(), np.flatnonzero(INNER)[25]
+    points[alone, 0] += px
+    found = tracker.track(gels.exposed(gels.dots(points), seed=2)).found
+    assert (bool(found[25]), found.sum()) == (believed, len(found) - (not believed))
+
+
 def test_the_spread_follows_the_noise_as_documented():
-    """√(1/ρ² − 1) times what the window itself allows."""
+    """√(1/ρ² − 1) times what the window itself allows, which is once to three times the error."""
     patches, rest = Patches(REST, POINTS[INNER], 7), gels.dots(POINTS)
     per_noise = []
     for level in (3.0, 20.0):
-        found = patches.find(gels.exposed(rest, noise=level), POINTS[INNER])
+        found = patches.find(gels.exposed(rest, noise=level, seed=1), POINTS[INNER])
         per_noise.append(found.spread_px / np.sqrt(1 / found.likeness.astype(float) ** 2 - 1))
     np.testing.assert_allclose(*per_noise, rtol=0.02)
+    error = np.hypot(*(found.points_px - POINTS[INNER]).T)
+    assert 1 < np.sqrt(np.mean(found.spread_px**2) / np.mean(error**2)) < 3
 
 
 def test_wrong_pictures_are_refused(tracker):

@@ -1,10 +1,12 @@
 """Rewards at the corners of what can be answered, asked and felt: all finite, or named before training."""
 
+import itertools
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from touchr1_jax.rewards import GroupReward, HostReward, Reward, RewardError, make_rewards, uniform_prior
+from touchr1_jax.rewards import GroupReward, HostReward, Reward, RewardError, make_rewards, proof, uniform_prior
 from touchr1_jax.rewards.proof import prove_rewards
 
 S, A = 4, 4
@@ -35,16 +37,29 @@ def test_every_reward_of_the_package_is_finite(levels, sensors):
         Reward(lambda p, t: jnp.log(p.length / 20)),
         Reward(lambda p, t: jnp.sum(1.0 * t.label * t.asked) / jnp.sum(t.asked)),
         Reward(spread_of_sensors),
-        Reward(lambda p, t: 1.0 / (t.levels[0] - 2)),
-        Reward(lambda p, t: jnp.sqrt(t.label[0] * 1.0)),
         Reward(lambda p, t: 1.0 / (2.0 - 1.0 * p.truncated - 1.0 * p.formatted)),
         GroupReward(spread_of_group),
     ],
-    ids=["no tokens", "nothing asked", "one sensor", "two levels", "unknown label", "cut off and formatted", "alone"],
+    ids=["no tokens", "nothing asked", "one sensor", "cut off and formatted", "alone"],
 )
 def test_a_reward_that_is_not_finite_somewhere_is_named(reward):
     with pytest.raises(RewardError, match=r"reward 'mine' is (nan|-?inf) for .*: must be finite everywhere"):
         prove_rewards({"mine": reward}, ["mine"], S, A)
+
+
+def test_corners_are_those_of_the_docstring():
+    targets, answers = proof._targets(S, A), proof._answers(S, A)
+    sizes = itertools.product((0, 1, A), (2, 3, 9), (False, True), (0, 1, 2, S))
+    parts = (targets.asked.sum(-1), targets.label[:, 0], targets.levels[:, 0], targets.ordinal[:, 0])
+    found = zip(*(np.asarray(x).tolist() for x in (*parts, targets.streams.sum(-1))), strict=True)
+    assert set(found) == {(a, x, k, o, n) for a, k, o, n in sizes for x in (-1, 0, k - 1)}
+    felt = {"⊥": (-1, -1, -1, -1), "lowest": (0, 0, 0, 0), "at odds": (0, 1, 0, 1), "highest": (2, 2, 2, 2)}
+    parts = (answers.perceive[:, :, 0], answers.conclude[:, 0], answers.formatted, answers.truncated, answers.length)
+    found = zip(*(np.asarray(x).tolist() for x in parts), strict=True)
+    bools = (False, True)
+    assert {(tuple(x), *rest) for x, *rest in found} == {
+        (x, x[1], *rest) for x, *rest in itertools.product(felt.values(), bools, bools, (0, 1, 20))
+    }
 
 
 def test_a_reward_on_the_host_is_not_called_before_training():

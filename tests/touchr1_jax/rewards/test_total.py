@@ -39,6 +39,7 @@ def test_nothing_applies():
 
 
 def test_the_sum_of_the_weights_is_kept():
+    check_weights(REWARDS, {"accuracy": 1e-9, "format": 1e9})
     for target in (make_target(), make_target(streams=(1, 0, 0))):
         assert total({name: 3 * w for name, w in WEIGHTS.items()}, constant(0), target)[0] == pytest.approx(3)
 
@@ -56,6 +57,8 @@ def test_every_reward_is_a_scalar(name):
         ({"acuracy": 1.0}, r"no reward is called 'acuracy'; choose from accuracy, accuracy_debiased, accuracy_strict"),
         ({"accuracy": -1.0}, r"weights\[accuracy\] is -1\.0: must be finite and ≥ 0"),
         ({"accuracy": float("nan")}, r"weights\[accuracy\] is nan: must be finite"),
+        ({"accuracy": 0.9e-9}, r"weights\[accuracy\] is 9e-10: must be finite and ≥ 0, and 1e-09 … "),
+        ({"accuracy": 1.1e9}, r"weights\[accuracy\] is 1100000000\.0: must be finite"),
         ({"accuracy": 0.0}, r"at least one must be above 0"),
         ({}, r"weights is \{\}: at least one"),
     ],

@@ -184,21 +184,21 @@ def test_information_of_a_question_about_a_kind():
 
 
 def test_statistics_of_actions_by_hand():
-    """Two trajectories of each of two questions: 1, 2, 0 and 2 actions, of which one of five observes nothing."""
-    action = np.array([[[0, -1], [1, 0]], [[-1, -1], [0, 1]]])
+    """Two trajectories of each of three prompts, two of one question: 1, 2, 0, 2, 0, 0 actions; one is silent."""
+    action = np.array([[[0, -1], [1, 0]], [[-1, -1], [0, 1]], [[-1, -1], [-1, -1]]])
     exists = np.repeat((action >= 0)[..., None], 3, -1)
     exists[0, 1, 1] = False
-    found = types.SimpleNamespace(action=action, exists=exists, seconds=np.ones((2, 2)), harm=np.zeros((2, 2)))
-    batch = types.SimpleNamespace(target=types.SimpleNamespace(asked=np.eye(2, dtype=bool)))
+    found = types.SimpleNamespace(action=action, exists=exists, seconds=np.ones((3, 2)), harm=np.zeros((3, 2)))
+    batch = types.SimpleNamespace(target=types.SimpleNamespace(asked=np.eye(2, dtype=bool)[[0, 1, 1]]))
     metrics = jax.jit(lambda: exploration_metrics(found, batch, ("press", "slide")))()
     assert {name: float(value) for name, value in metrics.items()} == pytest.approx(
         {
-            "actions": 5 / 4,
+            "actions": 5 / 6,
             "seconds": 1,
             "harm": 0,
-            "no_action_share": 1 / 4,
-            "one_action_share": 1 / 4,
-            "all_actions_share": 1 / 2,
+            "no_action_share": 3 / 6,
+            "one_action_share": 1 / 6,
+            "all_actions_share": 2 / 6,
             "silent_share": 1 / 5,
             "first_kind_peak": 2 / 3,
             "first_kind_information": np.log(27 / 16) / 3,

@@ -40,25 +40,25 @@ HEALTHY = {
     "drawn_all_right_share": 0.5,
     "drawn_accuracy": 0.7,
 }
-FAILURES = [
-    ("F1", {"middle_rate": 0.9}, 0.9 - 1 / 3),
-    ("F2", {"echo_share": 1.0, "echo_right": 0.33, "accuracy": 0.33}, 0.67),
-    ("F3", {"grounding": 3.0}, 3.0),
-    ("F4", {"control_noise": 0.1, "control_order": 0.7}, 0.6),
+FAILURES = [  # each by less than its bound beyond it
+    ("F1", {"middle_rate": 0.7}, 0.7 - 1 / 3),
+    ("F2", {"echo_share": 0.85, "echo_right": 0.7}, 0.15),
+    ("F3", {"grounding": 1.5}, 1.5),
+    ("F4", {"control_noise": 0.1, "control_order": 0.5}, 0.4),
     ("F5", {"bonus_cancelled_share": 0.3}, 0.75),
     ("F6", {"touch_score": 0.4, "tactile_credit_share": 0.3}, 0.3),
     ("F6", {"credit_unearned_share": 0.2}, 0.2),
-    ("F8", {"kl_cost_peak": 3.0, "accuracy": 0.5}, 3.0),
+    ("F8", {"kl_cost_peak": 1.5, "accuracy": 0.5}, 1.5),
     ("F9", {"entropy": 0.01}, 0.02),
-    ("F9", {"entropy": 2.5}, 2.0),
+    ("F9", {"entropy": 0.8}, 0.3),
     ("F10", {"grounding_stream_1": 0.0}, 0.0),
-    ("F12", {"static_time_share": 1.0}, 1.0),
+    ("F12", {"static_time_share": 0.015}, 0.015),
     ("F7", {"drawn_degenerate_share": 0.9, "drawn_all_right_share": 0.5, "drawn_accuracy": 0.65}, 0.8),
     ("F10", {"touch_share": 0.0}, 0.0),
-    ("F13", {"gamed_share": 0.5}, 0.5),
-    ("F15", {"nonfinite_share": 0.1}, 0.1),
-    ("F15", {"nonfinite_share": 0.1, "drawn_nonfinite_share": 0.0}, 0.1),  # a KL in the reward, of the selected alone
-    ("F16", {"sampler_gap": 0.4}, 0.4),
+    ("F13", {"gamed_share": 0.3}, 0.3),
+    ("F15", {"nonfinite_share": 0.03}, 0.03),
+    ("F15", {"nonfinite_share": 0.03, "drawn_nonfinite_share": 0.0}, 0.03),  # KL in the reward, of the selected alone
+    ("F16", {"sampler_gap": 0.15}, 0.15),
 ]
 
 
@@ -86,6 +86,8 @@ NO_FAILURE = {
     "all right in most groups": {"drawn_degenerate_share": 0.95, "drawn_all_right_share": 0.95},
     "all right in all groups": {"drawn_degenerate_share": 1.0, "drawn_all_right_share": 1.0},
     "constant groups, and answers get better": {"drawn_degenerate_share": 0.9, "drawn_accuracy": 0.75},
+    "a lower entropy": {"entropy": 0.035},
+    "a stream that counts little": {"grounding_stream_1": 1.5e-7},
     "low entropy of right answers": {"entropy": 0.01, "accuracy": 0.99},
     "low entropy of better answers": {"entropy": 0.01, "accuracy": 0.85},
     "a costly token, and answers hold": {"kl_cost_peak": 3.0},

@@ -74,6 +74,9 @@ def test_a_group_of_one_has_nothing_to_be_compared_with():
         GRPOConfig(group=1)
     with pytest.raises(ValueError, match="best_of is 9: must be at most group 8"):
         GRPOConfig(algorithm=Paper(best_of=9))
+    with pytest.raises(ValueError, match=r"best_of is 2: must be .* 1 for advantage PER_REWARD"):
+        GRPOConfig(algorithm=Paper(best_of=2, advantage=Advantage.PER_REWARD))
+    assert GRPOConfig(algorithm=Paper(best_of=8)).algorithm.best_of == 8
     assert GRPOConfig(group=1, algorithm=ReinforcePlusPlus()).group == 1
 
 

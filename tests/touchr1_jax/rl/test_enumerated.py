@@ -244,6 +244,7 @@ def test_a_level_that_nobody_said_and_whose_reward_is_nan_costs_its_group():
     found, finite, shares = level_rewards(broken, LEVELS, tokens, target, sampled, counts)
     np.testing.assert_array_equal(finite, [True, False])
     assert shares == {"nonfinite_in_levels": 0.5}
+    np.testing.assert_array_equal(found.ids, [LEVELS.level[0]] * 2)
     np.testing.assert_allclose(found.reward[0, 0, :3], 1)
     np.testing.assert_allclose(found.reward[1], 0)
 

@@ -10,7 +10,7 @@ import pytest
 from tests.touchr1_jax import explored
 from tests.touchr1_jax.explored import BANK, BUDGET
 from touchr1_jax.rl.gymnasium_env import Episodes, make_gymnasium_env
-from touchr1_jax.rl.touch_reward import Prices
+from touchr1_jax.rl.touch_reward import Prices, priced_answer
 
 PRICES = Prices(jnp.float32(0.05), jnp.float32(0.1))
 OBJECTS = (0, 1, 3)
@@ -29,8 +29,9 @@ def test_without_gymnasium_the_error_says_what_to_install(monkeypatch):
 
 @pytest.fixture
 def env():
+    """Each action costs .25 beside its seconds."""
     pytest.importorskip("gymnasium")
-    return make()
+    return make(reward=lambda *of: priced_answer(*of) | {"actions": -0.25 * of[2].actions})
 
 
 def test_gymnasiums_check_passes(env):
@@ -48,7 +49,7 @@ def test_an_episode_by_hand(env):
     assert (reward, ended, totals["actions"]) == (0.0, False, (1,))
     _, reward, ended, _, totals = env.step(2 + int(BANK.label[1, 1]))
     assert ended
-    assert reward == pytest.approx(1 - 0.05 * BANK.seconds[1, 1] - 0.1 * BANK.harm[1, 1], rel=1e-5)
+    assert reward == pytest.approx(0.75 - 0.05 * BANK.seconds[1, 1] - 0.1 * BANK.harm[1, 1], rel=1e-5)
 
 
 def test_a_contact_that_is_missing_is_not_seen(env):
@@ -64,7 +65,7 @@ def test_one_action_too_many_ends_without_an_answer(env):
         assert not env.step(0)[2]
     _, reward, ended, *_ = env.step(0)
     assert ended
-    assert reward == pytest.approx(-0.1 - BUDGET * 0.05 * BANK.seconds[0, 0], rel=1e-5)
+    assert reward == pytest.approx(-0.1 - BUDGET * (0.25 + 0.05 * BANK.seconds[0, 0]), rel=1e-5)
 
 
 def test_beliefs_may_take_the_place_of_tokens():

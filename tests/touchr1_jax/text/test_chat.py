@@ -124,6 +124,7 @@ def test_prompts_of_qwen3_are_what_its_template_writes():
     text = text.replace("<|image_pad|>", 4 * "<|image_pad|>")
     assert layout.ids[0][layout.mask[0]].tolist() == list(TOKENIZER.encode(text))
     assert (layout.ids[:, layout.touch] == TOKENIZER.tactile_id).all()
+    assert set(layout.step_text) == {-1, *layout.touch[:, ::3].ravel()}
     own = np.flatnonzero(layout.step_text == layout.touch[1, 3])  # the second step of the second stream
     assert TOKENIZER.decode(layout.ids[0, own]) == "<1.0 seconds>"
     assert (layout.stream_text[own] == 1).all()
