@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tests.touchr1_jax.text.vocabularies import LANGUAGES, TRICKY, make_tokenizer
+from touchr1_jax.text.characters import A_BREAK, A_WORD, Spelling
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.text.lexer import EMPTY_CLASS, FIRST_PHRASE, FIRST_TAG, TEXT, compile_lexer, phrases_of, tags_of
 from touchr1_jax.text.tokenizer import Tokenizer
@@ -90,3 +91,11 @@ def test_tables_stay_small_for_a_big_vocabulary():
     assert lexer.token_class.shape == (4, 30_004)
     assert len(lexer.next_state) < 3_000
     assert lexer.events.shape[1] <= 6
+
+
+@pytest.mark.parametrize(("char", "case"), [("é", A_WORD), ("中", A_WORD), ("、", A_BREAK), ("🖐", A_BREAK)])
+def test_a_character_is_the_same_wherever_it_is_cut(char, case):
+    code = char.encode()
+    for i in range(1, len(code)):
+        cut = Spelling((code[:i], code[i:]))
+        assert cut.completes[cut.head[1], cut.tail[0]] == case
