@@ -44,6 +44,11 @@ class GuideConfig:
                 raise ValueError(f"{field.name} is {getattr(self, field.name)}: must be > 0; raise it")
         if self.cover > 1:
             raise ValueError(f"cover is {self.cover}: must be ≤ 1, a share; lower it")
+        if self.least_radius >= self.most_radius:
+            raise ValueError(
+                f"least_radius is {self.least_radius}: must be < most_radius, {self.most_radius}, else no press is "
+                "taken; lower it"
+            )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -27,6 +27,7 @@ FIXES = {
     errno.EROFS: "make it writable, or name another path",
     errno.ENOENT: "name a path that is there; a folder must stay while it is written",
     errno.ENOTDIR: "a file is in the place of a folder: move it away, or name another path",
+    errno.EEXIST: "a file is in the place of a folder: move it away, or name another path",
     errno.ENAMETOOLONG: "name a shorter path",
     errno.EMFILE: "raise the limit of open files (ulimit -n)",
 }

@@ -18,6 +18,7 @@ from sensors_io.devices.base import Device
 from sensors_io.devices.errors import DeviceNotFoundError, DeviceTimeoutError, StreamEndedError
 from sensors_io.fields.sources import read_picture
 from sensors_io.fields.types import CalibrationError, write_whole
+from sensors_io.index import INDEX
 from sensors_io.locks import write_lock
 from sensors_io.viewer.server import LiveView, Numbers
 
@@ -48,24 +49,26 @@ class Snap(Bench):
         with contextlib.ExitStack() as stack:
             stop = stack.enter_context(stop_on_interrupt())
             device = stack.enter_context(opened(self.device))
-            pitch = self.mm_per_px or device.identity.mm_per_px
-            if not (pitch and pitch > 0 and self.ball_diameter_mm > 0):
+            pitch = device.identity.mm_per_px if self.mm_per_px is None else self.mm_per_px
+            if pitch is None or not 0 < pitch < 1 or self.ball_diameter_mm <= 0:
                 raise CalibrationError(
-                    f"mm_per_px is {pitch}, ball_diameter_mm {self.ball_diameter_mm:g}: both must be > 0; measure them "
-                    "(mm_per_px: width of the gel that the picture shows over its pixels)"
+                    f"mm_per_px is {pitch}, ball_diameter_mm {self.ball_diameter_mm:g}: must lie in (0, 1) and be > 0; "
+                    "measure them (mm_per_px: width of the gel that the picture shows over its pixels)"
                 )
+            if (self.out / INDEX).exists():
+                raise CalibrationError(f"--out is {self.out}: holds records, and nothing else may; name another folder")
             self.out.mkdir(parents=True, exist_ok=True)
             stack.enter_context(write_lock(self.out))
             live = stack.enter_context(LiveView(port=self.port))
             OUT.print(f"guidance at {live.address}, Ctrl-C ends", highlight=False)
-            guide, said = self._guide(pitch), ""
+            guide, said, ended = self._guide(pitch), "", ""
             while not stop.is_set() and not guide.done:
                 try:
                     sample = device.read(_TIMEOUT_S)
                 except DeviceTimeoutError:
                     continue
                 except StreamEndedError as end:
-                    OUT.print(str(end), markup=False)
+                    ended = str(end)
                     break
                 if sample.frame is None or sample.frame.ndim != 3:
                     raise DeviceNotFoundError(f"{device.identity.sensor} gives no pictures: snap needs a camera")
@@ -75,6 +78,11 @@ class Snap(Bench):
                     said = guidance.prompt.partition(",")[0]
                     OUT.print(guidance.prompt, markup=False, highlight=False)
         self._close(guide, pitch)
+        if ended:
+            raise StreamEndedError(
+                f"{ended}, before {self.config.presses} presses that cover {self.config.cover:.0%} were taken: what "
+                f"there was is in {self.out}; replay a longer recording"
+            )
         return 0
 
     @property

@@ -194,7 +194,7 @@ class NetFt:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, self._RECEIVE_BUFFER)
             self._socket.connect((c.host, c.rdt_port))
             self._command(Command.STREAM_BUFFERED if c.buffered else Command.STREAM)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:  # the second is of a name that no address can have
             self._close()
             raise DeviceNotFoundError(
                 f"NetFT at {c.host} does not answer ({error}); look at its power, cable and address"

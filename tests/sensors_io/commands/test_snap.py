@@ -13,7 +13,9 @@ from sensors_io.devices.replay import ReplayConfig
 from sensors_io.fields.sources import read_picture
 from sensors_io.fields.types import CalibrationError
 from sensors_io.locks import write_lock
+from tests.sensors_io import fakes
 from tests.sensors_io.calibration.synthetic import press_ball, spread_touches
+from tests.sensors_io.checks import refused
 
 TOUCHES = spread_touches(10)
 QUICK = GuideConfig(presses=10, cover=0.1, rest_frames=3, steady_frames=2)
@@ -87,9 +89,28 @@ def test_pictures_of_another_size_are_named(tmp_path: pathlib.Path, presses: Bal
         snap._see(guide, presses.pictures[0][:-1])
 
 
-def test_a_share_beyond_one_is_never_covered() -> None:
-    with pytest.raises(ValueError, match=r"cover is 1\.1: must be ≤ 1"):
-        GuideConfig(cover=1.1)
+def test_guides_that_take_no_press_are_refused() -> None:
+    refused(ValueError, r"cover is 1\.1: must be ≤ 1", GuideConfig, cover=1.1)
+    refused(ValueError, r"least_radius is 0\.95: must be < most_radius, 0\.95", GuideConfig, least_radius=0.95)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ([], "shots has been replayed to its end, before 30 presses that cover"),
+        (["--mm-per-px", "0"], "mm_per_px is 0.0, ball_diameter_mm 4: must lie in (0, 1)"),
+        (["--mm-per-px", "5"], "mm_per_px is 5.0, ball_diameter_mm 4: must lie in (0, 1)"),
+        (["--out", "records"], "--out is records: holds records, and nothing else may"),
+    ],
+)
+def test_a_session_that_takes_too_little_or_spoils_records_fails(tmp_path, presses, capsys, monkeypatch, options, said):
+    monkeypatch.chdir(tmp_path)
+    fakes.write(tmp_path / "records", 1)
+    _write(tmp_path / "shots" / "1.png", presses.background)
+    words = ["--out", "out", "--ball-diameter-mm", "4", "--mm-per-px", "0.1", "--port", "0", *options]
+    assert main(["snap", *words, "replay", "--path", "shots"]) == 1
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "records" / "presses").exists()
 
 
 def test_two_sessions_do_not_take_their_pictures_into_one_folder(tmp_path, presses, capsys):

@@ -103,6 +103,8 @@ def test_an_absent_sensor_is_named():
     config = NetFtConfig(host="127.0.0.1", tcp_port=port, wait_s=0.5)
     with pytest.raises(DeviceNotFoundError, match="does not answer"), config.open():
         pass
+    with pytest.raises(DeviceNotFoundError, match="label"), NetFtConfig(host="x" * 300).open():  # no name of a host
+        pass
     refused(DeviceLostError, "not open", lambda: config.open().read(0.1))
     for rate_hz in (0, float("nan"), float("inf")):
         refused(ValueError, f"rate_hz is {rate_hz}", NetFtConfig, rate_hz=rate_hz)
