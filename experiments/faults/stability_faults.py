@@ -4,13 +4,13 @@
 
 Kills: `kill -9` ends training at random moments, a quarter of them during start-up, and the run is continued until it
 is finished; it is compared bit by bit with an undisturbed one.  The GRPO of a study is killed 200 times, a complete
-study a few times, and once each of several studies that share an empty cache with another one; their networks are so
-small that the loop takes most of the time of a step.  Damage: every file of an
-unfinished run, in four ways, and single bits in all files of a study and its cache.  Bad input: about forty kinds
-through the public command lines.  Waiting: the share of a step that waits for data, on a CPU.
+study a few times, and at nine moments one of two studies that begin together on an empty cache; their networks are so
+small that the loop takes most of the time of a step.  Damage: every file of an unfinished run, in four ways, and single
+bits in all files of a study and its cache.  Bad input: about forty kinds through the public command lines.  Waiting:
+the share of a step that waits for data, on a CPU.
 
-Cost: 111 minutes in the recorded run on one core of a busy machine, most of it the 200 kills; `--scale smoke` eight
-minutes of one core where nothing is compiled yet.
+Cost: 111 minutes in the recorded run on one core of a busy machine, most of it the 200 kills, without the pairs of
+studies, which take one to three minutes each; `--scale smoke` eight minutes of one core where nothing is compiled yet.
 
 Expected: no difference in any bit; no wrong result; for every bad input an error that names the place and the fix;
 waits below 2 % of a step.

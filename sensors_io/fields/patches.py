@@ -107,7 +107,8 @@ class Patches:
             σ_d = σ √(tr (N⁻¹)_dd / left),   σ² = s² (1/ρ² − 1)
 
         N is the normal matrix, s the contrast of the reference window; the blur leaves a share of the noise's variance
-        and makes neighbours alike, so that the fit sees the noise of the unblurred picture.
+        and makes neighbours alike, so that the fit sees the noise of the unblurred picture.  N takes the weights of the
+        window for inverse variances: under white noise σ_d is about twice the actual deviation.
         """
         covariance = np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
         contrast = self._template - (self._template @ self._weight)[:, None]
