@@ -97,7 +97,7 @@ def test_guides_that_take_no_press_are_refused() -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ([], "shots has been replayed to its end, before 30 presses that cover"),
+        ([], "shots has been replayed to its end, before a press was taken"),
         (["--mm-per-px", "0"], "mm_per_px is 0.0, ball_diameter_mm 4: must lie in (0, 1)"),
         (["--mm-per-px", "5"], "mm_per_px is 5.0, ball_diameter_mm 4: must lie in (0, 1)"),
         (["--out", "records"], "--out is records: holds records, and nothing else may"),
