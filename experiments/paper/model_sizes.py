@@ -17,9 +17,9 @@ from experiments.core.loops import STEPPING
 from experiments.core.metric_log import read_metrics
 from experiments.core.results import Estimate, Table, named_table
 from experiments.core.text import bounds, number
-from experiments.paper.components import run_full_model
+from experiments.paper.components import FULL, run_full_model
 from experiments.study.stages import answer_feed
-from experiments.study.study import Study, StudyConfig
+from experiments.study.study import SFT, Study, StudyConfig
 from touchr1_jax.bench.scoring import REPORTED
 from touchr1_jax.bench.statistics import Interval, student_interval
 from touchr1_jax.models.lm import DecoderConfig
@@ -81,9 +81,10 @@ def study_of_size(config: StudyConfig, name: str, context: Context) -> tuple[Stu
     with contextlib.closing(inner), context.timed(f"study/{name}"):
         study = run_full_model(config, inner)
         for line in read_metrics(directory):
-            phase, seed = line["stage"].split("/")[0], line["stage"].split("/")[-1]
+            phase, *arm, seed = line["stage"].split("/")
+            curve = "_".join([name, *(part for part in arm if part not in (FULL, SFT))])
             scalars = {key: value for key, value in line.items() if key not in ("stage", "step")}
-            context.log(f"{phase}/{name}/{seed}", line["step"], **scalars)
+            context.log(f"{phase}/{curve}/{seed}", line["step"], **scalars)
         return study, inner.timing()
 
 
