@@ -132,7 +132,7 @@ def paths(adapters) -> set[str]:
     [
         (
             {"targets": ("q_proj", "query")},
-            r"targets \['query'\] are no dense layers of decoder; name .* 'down', .*'up'",
+            r"targets \['query'\] are no dense layers of decoder; name others, of \['down'",
         ),
         ({"vision_targets": ("nose",)}, r"targets \['nose'\] are no dense layers of vision"),
     ],
