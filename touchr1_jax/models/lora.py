@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from touchr1_jax.models.layers import SizeError
 from touchr1_jax.models.stacked import ADAPTERS
 from touchr1_jax.models.vmappable_dense import linear
 from touchr1_jax.types import Params
@@ -95,12 +96,19 @@ def init_adapters(key: Array, base: Params, config: LoraConfig) -> Adapters:
       config: which layers.
 
     Raises:
-      ValueError: a layer or tower that the base lacks.
+      SizeError: a layer or tower that the base lacks.
     """
     shapes = {path: leaf.shape for path, leaf in _kernels(base, config)}
     for tower, layers in config.towers.items():
         if lacking := {*layers} - {path[-1] for path in shapes if path[0] == tower}:
-            raise ValueError(f"targets {sorted(lacking)} are no dense layers of {tower}; name others")
+            there = sorted(
+                {
+                    path[-2]
+                    for path in flax.traverse_util.flatten_dict(base)
+                    if path[0] == tower and path[-1] == "kernel"
+                }
+            )
+            raise SizeError(f"targets {sorted(lacking)} are no dense layers of {tower}; name others, of {there}")
     keys = jax.random.split(key, len(shapes))
     fresh = {
         path: Adapter(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.touchr1_jax import tiny
-from touchr1_jax.models.layers import GatedMLP
+from touchr1_jax.models.layers import GatedMLP, SizeError
 from touchr1_jax.models.lm import Decoder
 from touchr1_jax.models.lora import Adapter, LoraConfig, adapted, by_layer, init_adapters, merge, merged_kernel
 
@@ -130,12 +130,15 @@ def paths(adapters) -> set[str]:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"targets": ("q_proj", "query")}, r"targets \['query'\] are no dense layers of decoder; name others"),
+        (
+            {"targets": ("q_proj", "query")},
+            r"targets \['query'\] are no dense layers of decoder; name others, of \['down'",
+        ),
         ({"vision_targets": ("nose",)}, r"targets \['nose'\] are no dense layers of vision"),
     ],
 )
 def test_layers_must_exist(base, change, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(SizeError, match=message):
         init_adapters(jax.random.key(0), base, dataclasses.replace(LORA, **change))
 
 
