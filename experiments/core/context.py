@@ -21,8 +21,8 @@ from experiments.core.artifacts import (
     read_json,
     write_arrays,
     write_sealed,
-)  # fmt: skip
-from experiments.core.metric_log import MetricLog, damaged_log, read_metrics
+)
+from experiments.core.metric_log import MetricLog, damaged_log, read_metrics, summary
 from experiments.core.progress import Advance, Loop, ProgressCallback, TrainingSample, Watcher, show_progress
 from experiments.core.stopping import Stopping
 from sensors_io.arrays import ArraysError, load_arrays
@@ -112,16 +112,19 @@ class Context:
     def ended(self, stage: str) -> None:
         """Keep the number and the checksum of the lines of a stage that has ended, for `require_log`."""
         if self._log is not None:
-            write_sealed(self._stage_file(f"{_LOGGED}/{stage}"), {"lines": self._log.summary(stage)})
+            write_sealed(
+                self._stage_file(f"{_LOGGED}/{stage}"), {"lines": summary(self._log.by_stage().get(stage, []))}
+            )
 
     def require_log(self) -> None:
         """`DamagedFileError` unless the log has the lines of all stages that have ended; no other look may be taken."""
         folder = self.directory / "stages" / _LOGGED
         if self._log is None:
             return
+        lines = self._log.by_stage()
         for path in sorted(folder.rglob("*.json")):
             stage, kept = path.relative_to(folder).with_suffix("").as_posix(), read_json(path)["lines"]
-            if self._log.summary(stage, kept[0]) != kept:
+            if summary(lines.get(stage, [])[: kept[0]]) != kept:
                 how = f"of the {kept[0]} lines of stage {stage} some are missing or changed"
                 raise damaged_log(self.directory / "metrics.jsonl", how)
 

@@ -45,11 +45,14 @@ class MetricLog:
             lines = _whole_lines(self._path)
             self._replace(lines, sorted(lines, key=lambda line: _seed(_row(line, self._path)["stage"])))
 
-    def summary(self, stage: str, first: int | None = None) -> list[int]:
-        """The number of lines of a stage, or of its first ones, and their CRC-32."""
+    def by_stage(self) -> dict[str, list[str]]:
+        """The lines of each stage, in order."""
         with self._lock:
-            lines = [line for line in _whole_lines(self._path) if _row(line, self._path)["stage"] == stage][:first]
-        return [len(lines), zlib.crc32("".join(lines).encode())]
+            lines = _whole_lines(self._path)
+        found: dict[str, list[str]] = {}
+        for line in lines:
+            found.setdefault(_row(line, self._path)["stage"], []).append(line)
+        return found
 
     def _replace(self, lines: list[str], by: list[str]) -> None:
         if lines != by:
@@ -86,6 +89,11 @@ class MetricLog:
             yield
         except OSError as error:
             raise UnwrittenError(f"{self._path} cannot be written ({error}): free some space, then continue") from error
+
+
+def summary(lines: Sequence[str]) -> list[int]:
+    """The number of lines and their CRC-32."""
+    return [len(lines), zlib.crc32("".join(lines).encode())]
 
 
 def read_metrics(directory: Path) -> list[dict[str, Any]]:
