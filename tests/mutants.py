@@ -222,7 +222,7 @@ def run(arguments: list[str], plugin: Callable[[], Any], mutant: Mutant | None, 
     code = process.exitcode
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
-    if code is not None and code >= 0 and code - DONE not in (0, 1, 2):
+    if code is not None and code >= 0 and code - DONE not in (0, 1, 2, 3):  # passed, failed, interrupted, crashed
         raise RuntimeError(f"pytest ended with {code} for {mutant}: read {state / 'printed.txt'}")
     return code == DONE
 
