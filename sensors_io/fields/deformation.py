@@ -72,14 +72,15 @@ class DeformationReader:
         self._field = self._make_field(grey.shape)
         self._near = self._make_near(grey.shape)
 
-    def read(self, picture: np.ndarray, gap: bool = False) -> Deformation:
+    def read(self, picture: np.ndarray, gap: bool = False, apart: bool = False) -> Deformation:
         """The displacement in one picture.
 
         Args:
           picture: RGB uint8 [H, W, 3], of the same crop as the one at rest.
           gap: whether frames are missing before it.
+          apart: whether it follows no other picture.
         """
-        tracked = self.tracker.track(_grey(picture), gap)
+        tracked = self.tracker.track(_grey(picture), gap, apart)
         displacement_px = self._field(tracked.points_px - self.tracker.points_px)
         lost = float(np.mean(~tracked.found))
         return Deformation(

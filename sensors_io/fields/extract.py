@@ -110,7 +110,7 @@ class Extractor:
           picture: of the same crop as the background.
           gap: whether frames are missing before it: flagged `TIME_GAP`, and markers are looked for anywhere.
           apart: whether nothing says that it follows the picture before, as with stills: markers are looked for
-            anywhere, with no flag.
+            anywhere, whatever was read before, with no flag.
 
         Raises:
           SchemaError: a picture of another shape than the background.
@@ -126,7 +126,7 @@ class Extractor:
         if surface is not None and not surface.zero_known:
             flags |= Flag.NO_ZERO_LEVEL
         if self._deformation is not None:
-            moved = self._deformation.read(picture, gap or apart)
+            moved = self._deformation.read(picture, gap, apart)
             flags |= moved.flags
             found["deformation_mm"] = moved.displacement_mm
             if self._shear is not None and depth is not None:

@@ -121,22 +121,26 @@ class Tracker:
         """The points at rest [P, 2]."""
         return self._start
 
-    def track(self, picture: np.ndarray, gap: bool = False) -> Tracked:
+    def track(self, picture: np.ndarray, gap: bool = False, apart: bool = False) -> Tracked:
         """Find the points in the next picture.
 
         Args:
           picture: grey, uint8 [H, W] as the reference.
           gap: whether frames are missing before it; the points may then be anywhere.
+          apart: whether it follows no other picture: the points may be anywhere, and what was tracked before it has no
+            influence.
 
         Raises:
           ValueError: a picture of another shape or type.
         """
         self._check(picture)
         picture = self._exposed_alike(picture)
+        if apart:
+            self._last = self._start
         points, found = self._forth(picture, self._last)
-        reseeded = gap or self._failed(points, found)
+        reseeded = gap or apart or self._failed(points, found)
         if reseeded:
-            points, found = self._recovered(picture, points, found, gap)
+            points, found = self._recovered(picture, points, found, gap or apart)
         points, found = self._gated(picture, points, found)
         self._last = self._completed(points, found)
         return Tracked(points_px=self._last, found=found, reseeded=reseeded)

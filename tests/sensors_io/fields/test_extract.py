@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from sensors_io.fields.deformation import DeformationReader
 from sensors_io.fields.evidence import Pattern
 from sensors_io.fields.extract import ExtractConfig, Extractor
 from sensors_io.fields.slopes import ColourMap
@@ -101,9 +102,18 @@ def test_a_marker_gel_with_calibration_gives_everything() -> None:
     np.testing.assert_allclose(subtracted, fields.deformation_mm, atol=1e-3)  # type: ignore[arg-type]
 
 
+def test_a_still_is_read_as_if_no_other_had_been() -> None:
+    """Of 18 px a pitch: after a motion of 8 px one of 14 px is that, and otherwise one of −4 px."""
+    extractor, stills = Extractor(dotted(), 0.1), np.stack([dotted(8.0), dotted(14.0)])
+    alone = [Extractor(dotted(), 0.1).extract(still[None]).deformation_mm for still in stills]
+    np.testing.assert_array_equal(extractor.extract(stills).deformation_mm, np.concatenate(alone))  # type: ignore[arg-type]
+
+
 def test_what_does_not_fit_together_is_refused() -> None:
     refused(CalibrationError, "must be equal; calibrate", lambda: Extractor(bare(), 0.2, calibration(bare())))
     refused(CalibrationError, "mm_per_px is 1.0: must lie in", calibration, bare(), 1.0)
+    refused(SchemaError, "background", calibration, bare().astype(np.float32))
+    refused(ValueError, "mm_per_px is 0: must be > 0", DeformationReader, dotted(), 0)
     contact, flags = np.zeros((2, 4, 5), bool), np.zeros(2, np.uint32)
     wrong = np.zeros((2, 4, 6), np.float32)
     refused(SchemaError, "depth_mm", Fields, contact=contact, flags=flags, mm_per_px=0.1, depth_mm=wrong)

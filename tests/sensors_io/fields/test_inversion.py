@@ -84,6 +84,31 @@ def test_shear_is_what_the_traction_makes(inverse, noisy):
     assert rms(found.by_traction_mm - true) < rms(linear.by_traction_mm - true)
 
 
+def test_a_tenth_of_the_displacement_is_a_tenth_of_the_load(inverse, noisy):
+    found, tenth = (inverse.contact(scale * noisy[..., :2], scale * noisy[..., 2]) for scale in (1.0, 0.1))
+    np.testing.assert_allclose(10 * tenth.traction_mpa, found.traction_mpa, atol=1e-5)
+
+
+def test_where_every_node_presses_the_solution_is_the_linear_one(inverse):
+    seen = moved(np.full((SIDE, SIDE, 3), [0.0, 0.0, -0.1]))
+    linear = inverse.linear(seen[..., :2], seen[..., 2])
+    assert np.all(linear.traction_mpa[..., 2] < 0)
+    found = inverse.contact(seen[..., :2], seen[..., 2], np.ones((SIDE, SIDE), bool))
+    np.testing.assert_allclose(found.traction_mpa, linear.traction_mpa, atol=1e-4)
+
+
+def test_half_of_every_length_is_the_same_load(noisy):
+    half = LayerInverse(
+        dataclasses.replace(GEL, thickness_mm=GEL.thickness_mm / 2),
+        NodeGrid(shape=(8, 9), pitch_mm=(0.5, 0.4), marker_depth_mm=0.15, depth_mm=0.15),
+        InverseConfig(lateral_noise_mm=0.004, depth_noise_mm=0.0075, smooth_mm=CONFIG.smooth_mm / 2),
+    )
+    whole = LayerInverse(GEL, dataclasses.replace(GRID, shape=(8, 9), pitch_mm=(1.0, 0.8)), CONFIG)
+    part = noisy[:8, :9]
+    found, expected = half.linear(part[..., :2] / 2, part[..., 2] / 2), whole.linear(part[..., :2], part[..., 2])
+    np.testing.assert_allclose(found.traction_mpa, expected.traction_mpa, atol=1e-4)
+
+
 def test_without_gradients_a_wrong_layer_makes_no_traction(noisy):
     """A gel taken for thinner, and for harder to compress, than it is."""
     wrong = Layer(modulus_mpa=0.3, poisson=0.495, thickness_mm=3.5 / 1.3)

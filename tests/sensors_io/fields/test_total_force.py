@@ -19,6 +19,11 @@ def test_a_linear_law_is_found():
     np.testing.assert_allclose(model.predict(new), new.reshape(5, 60) @ LAW + [1, 2, -5], atol=1e-2)
 
 
+def test_a_node_that_never_moves_changes_nothing():
+    still = np.concatenate([FIELDS, np.ones((200, 1, 6))], 1)
+    np.testing.assert_allclose(fit(still, FORCE).predict(still[:5]), fit(FIELDS, FORCE).predict(FIELDS[:5]), atol=1e-6)
+
+
 def test_the_reported_error_is_that_on_new_frames():
     noisy = FORCE + RNG.normal(0, 0.2, FORCE.shape)
     model = fit(FIELDS, noisy)

@@ -54,7 +54,7 @@ def test_a_lattice_is_followed_though_a_start_a_pitch_away_explains_more_dots(tr
     """Five dots of the last column are gone: 58 of 63 are where the motion leads, 63 a pitch to the left of it."""
     gone = np.flatnonzero(INNER & (POINTS[:, 0] > 170))[:5]
     for shift_px in (9, 18):
-        found = tracker.track(gels.exposed(gels.dots(np.delete(POINTS + [shift_px, 0], gone, axis=0)), seed=2))
+        found = tracker.track(gels.exposed(gels.dots(np.delete(POINTS, gone, axis=0) + np.array([shift_px, 0])), seed=2))
     assert (found.reseeded, found.found.sum()) == (True, 58)
     np.testing.assert_allclose(np.median(found.points_px - POINTS[INNER], 0), [18, 0], atol=0.05)
 
@@ -97,6 +97,7 @@ def test_the_spread_follows_the_noise_as_documented():
 def test_wrong_pictures_are_refused(tracker):
     refused(ValueError, r"must be uint8\[160, 200\]", tracker.track, REST[:-1])
     refused(ValueError, "must lie inside the picture", lambda: Patches(REST, np.array([[3.0, 50.0]]), 7))
+    refused(ValueError, "must lie inside the picture", lambda: Patches(REST, np.array([[193.0, 150.0]]), 7))
     corner = Patches(REST, np.array([[192.0, 152.0]]), 7)  # the last window inside
     assert corner.find(np.zeros_like(REST), np.array([[192.0, 152.0]])).likeness.tolist() == [0.0]
     refused(ValueError, "back_px is 0", TrackingConfig, back_px=0)

@@ -71,9 +71,10 @@ def test_prices_that_are_no_price_are_named(outcome, name, price):
         check_touch_reward(priced_answer, FREE._replace(**{name: jnp.float32(price)}), EVERY.target, outcome)
 
 
-@pytest.mark.parametrize("prices", [Prices(jnp.float32(1), jnp.float32(0)), Prices(jnp.float32(2), jnp.float32(9))])
-def test_prices_at_which_touching_never_pays_are_named(outcome, prices):
-    """An action that observes nothing is no touch, though it is free."""
+@pytest.mark.parametrize(("second", "harm"), [(0.2, 0), (1, 0), (2, 9)])
+def test_prices_at_which_touching_never_pays_are_named(outcome, second, harm):
+    """An action that observes nothing is no touch, though free; at .2 a touch costs less than the answer, and too much."""
+    prices = Prices(jnp.float32(second), jnp.float32(harm))
     exists, seconds = np.array(outcome.exists), np.array(outcome.seconds)
     exists[:, 0], seconds[:, 0] = False, 0.0
     outcome = outcome._replace(exists=exists, seconds=seconds)
