@@ -53,8 +53,9 @@ def test_a_jump_past_half_a_pitch_is_caught(tracker, peak):
 def test_a_lattice_is_followed_though_a_start_a_pitch_away_explains_more_dots(tracker):
     """Five dots of the last column are gone: 58 of 63 are where the motion leads, 63 a pitch to the left of it."""
     gone = np.flatnonzero(INNER & (POINTS[:, 0] > 170))[:5]
+    left = np.delete(POINTS, gone, axis=0)
     for shift_px in (9, 18):
-        found = tracker.track(gels.exposed(gels.dots(np.delete(POINTS, gone, axis=0) + np.array([shift_px, 0])), seed=2))
+        found = tracker.track(gels.exposed(gels.dots(left + np.array([shift_px, 0])), seed=2))
     assert (found.reseeded, found.found.sum()) == (True, 58)
     np.testing.assert_allclose(np.median(found.points_px - POINTS[INNER], 0), [18, 0], atol=0.05)
 
@@ -92,6 +93,16 @@ def test_the_spread_follows_the_noise_as_documented():
     np.testing.assert_allclose(*per_noise, rtol=0.02)
     error = np.hypot(*(found.points_px - POINTS[INNER]).T)
     assert 1 < np.sqrt(np.mean(found.spread_px**2) / np.mean(error**2)) < 3
+
+
+def test_a_picture_turned_over_gives_the_points_turned_over():
+    start, picture = POINTS[INNER], gels.exposed(gels.dots(moved(POINTS, 1.0)), noise=20.0, seed=1)
+    turned = Patches(np.ascontiguousarray(REST.T), start[:, ::-1], 7)
+    found, other = (
+        Patches(REST, start, 7).find(picture, start),
+        turned.find(np.ascontiguousarray(picture.T), start[:, ::-1]),
+    )
+    np.testing.assert_allclose(found.points_px, other.points_px[:, ::-1], atol=1e-3)
 
 
 def test_wrong_pictures_are_refused(tracker):

@@ -73,7 +73,7 @@ def test_prices_that_are_no_price_are_named(outcome, name, price):
 
 @pytest.mark.parametrize(("second", "harm"), [(0.2, 0), (1, 0), (2, 9)])
 def test_prices_at_which_touching_never_pays_are_named(outcome, second, harm):
-    """An action that observes nothing is no touch, though free; at .2 a touch costs less than the answer, and too much."""
+    """An action that observes nothing is no touch, though free; at 0.2 a touch costs half of the answer."""
     prices = Prices(jnp.float32(second), jnp.float32(harm))
     exists, seconds = np.array(outcome.exists), np.array(outcome.seconds)
     exists[:, 0], seconds[:, 0] = False, 0.0
