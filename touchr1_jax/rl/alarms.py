@@ -121,16 +121,17 @@ def _controls(now: Metrics) -> dict[str, float]:
 
 
 def idle_groups(now: Metrics, start: Metrics) -> float | None:
-    """F7: share of groups of equal rewards among those that are not all right, while answers do not improve.
+    """F7: share of groups of equal rewards among those that are not solved yet, while answers do not improve.
 
-    A group that is all right has nothing to learn.  Under dynamic sampling these are shares of all candidates
-    (`drawn_…` in the log), because the selected groups hide those that were not selected.
+    A group that is all right has nothing to learn, and alarm F15 counts those that are left out.  Under dynamic
+    sampling these are shares of all candidates (`drawn_…` in the log), because the selected groups hide those that
+    were not selected.
     """
     drawn = lambda metrics, name: metrics.get(f"drawn_{name}", metrics[name])
-    if drawn(now, "accuracy") > drawn(start, "accuracy"):
+    if "idle_share" not in now or drawn(now, "accuracy") > drawn(start, "accuracy"):  # older logs have none
         return None
-    solved = drawn(now, "all_right_share")
-    return (drawn(now, "degenerate_share") - solved) / (1 - solved) if solved < 1 else 0.0
+    unsolved = drawn(now, "unsolved_share")
+    return drawn(now, "idle_share") / unsolved if unsolved > 0 else 0.0
 
 
 def heavy_tail(now: Metrics, start: Metrics) -> float | None:

@@ -357,11 +357,11 @@ class GRPOEngine:
 
     def group_metrics(self, group: Group) -> dict[str, Array]:
         """Metrics of rollouts and rewards; with dynamic sampling, of all candidates and of the selected ones."""
-        target = group.batch.target
+        target, no_signal = group.batch.target, self.no_signal(group)
         right = jax.vmap(jax.vmap(tactile_use.right, in_axes=(0, None)))(group.parsed, target)
         return {
-            **reward_metrics(group.terms, right, group.finite),
-            **rollout_metrics(group.rollout, group.reward, self.no_signal(group), group.finite, group.parsed, target),
+            **reward_metrics(group.terms, right, no_signal, group.finite),
+            **rollout_metrics(group.rollout, group.reward, no_signal, group.finite, group.parsed, target),
         }
 
     def metrics(self, group: Group, learn: Experience) -> dict[str, Array]:
@@ -371,5 +371,5 @@ class GRPOEngine:
             **answer_metrics(group.parsed, group.batch.target, ordinal_levels(self.score)),
             **advantage_metrics(reward, learn.advantage),
             **tactile_use.bonus_metrics(algorithm, reward, group.terms, group.bonus, learn.advantage, group.finite),
-            **touch_metrics(group.batch.features),
+            **touch_metrics(group.batch.features, self.fns.step_tokens),
         }

@@ -8,8 +8,8 @@ from touchr1_jax.rl.alarms import WINDOW, AlarmMonitor
 HEALTHY = {
     "accuracy": 0.6,
     "grounding": 0.1,
-    "degenerate_share": 0.2,
-    "all_right_share": 0.2,
+    "unsolved_share": 0.8,
+    "idle_share": 0.1,
     "kl_cost_peak": 0.05,
     "entropy": 0.5,
     "perturbed_stream_0": 4.0,

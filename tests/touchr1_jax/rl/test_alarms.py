@@ -23,8 +23,8 @@ HEALTHY = {
     "tactile_credit_share": 0.6,
     "credit_unearned_share": 0.0,
     "bonus_cancelled_share": 0.0,
-    "degenerate_share": 0.6,
-    "all_right_share": 0.5,
+    "unsolved_share": 0.5,
+    "idle_share": 0.1,
     "kl_cost_peak": 0.05,
     "entropy": 0.5,
     "perturbed_stream_0": 4.0,
@@ -36,8 +36,8 @@ HEALTHY = {
     "touch_share": 1.0,
     "nonfinite_share": 0.0,
     "sampler_gap": 0.007,
-    "drawn_degenerate_share": 0.6,
-    "drawn_all_right_share": 0.5,
+    "drawn_unsolved_share": 0.5,
+    "drawn_idle_share": 0.1,
     "drawn_accuracy": 0.7,
 }
 FAILURES = [  # each by less than its bound beyond it
@@ -53,7 +53,7 @@ FAILURES = [  # each by less than its bound beyond it
     ("F9", {"entropy": 0.8}, 0.3),
     ("F10", {"grounding_stream_1": 0.0}, 0.0),
     ("F12", {"static_time_share": 0.015}, 0.015),
-    ("F7", {"drawn_degenerate_share": 0.9, "drawn_all_right_share": 0.5, "drawn_accuracy": 0.65}, 0.8),
+    ("F7", {"drawn_idle_share": 0.4, "drawn_accuracy": 0.65}, 0.8),
     ("F10", {"touch_share": 0.0}, 0.0),
     ("F13", {"gamed_share": 0.3}, 0.3),
     ("F15", {"nonfinite_share": 0.03}, 0.03),
@@ -83,9 +83,9 @@ def test_all_codes_are_covered():
 
 
 NO_FAILURE = {
-    "all right in most groups": {"drawn_degenerate_share": 0.95, "drawn_all_right_share": 0.95},
-    "all right in all groups": {"drawn_degenerate_share": 1.0, "drawn_all_right_share": 1.0},
-    "constant groups, and answers get better": {"drawn_degenerate_share": 0.9, "drawn_accuracy": 0.75},
+    "all right in most groups": {"drawn_unsolved_share": 0.05, "drawn_idle_share": 0.0},
+    "all right in all groups": {"drawn_unsolved_share": 0.0, "drawn_idle_share": 0.0},
+    "constant groups, and answers get better": {"drawn_idle_share": 0.4, "drawn_accuracy": 0.75},
     "a lower entropy": {"entropy": 0.035},
     "a stream that counts little": {"grounding_stream_1": 1.5e-7},
     "low entropy of right answers": {"entropy": 0.01, "accuracy": 0.99},
@@ -107,7 +107,7 @@ def test_without_dynamic_sampling_the_groups_are_those_that_are_learned_from():
     for _ in range(WINDOW):
         assert monitor.update(plain) == []
     for _ in range(WINDOW):
-        alarms = monitor.update(plain | {"degenerate_share": 0.9, "accuracy": 0.65})
+        alarms = monitor.update(plain | {"idle_share": 0.4, "accuracy": 0.65})
     assert [(a.code, round(a.value, 6)) for a in alarms] == [("F7", 0.8)]
 
 
@@ -173,6 +173,6 @@ def test_a_control_that_does_not_apply_says_nothing():
 
 
 def test_an_alarm_says_what_fired():
-    failing = HEALTHY | {"drawn_degenerate_share": 0.9, "drawn_accuracy": 0.65}
+    failing = HEALTHY | {"drawn_idle_share": 0.4, "drawn_accuracy": 0.65}
     (alarm,) = (a for a in [RULES[6].alarm(failing, HEALTHY)] if a)
     assert str(alarm) == f"alarm F7: {alarm.meaning} (0.8, bound 0.5)"
