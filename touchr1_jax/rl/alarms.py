@@ -93,8 +93,8 @@ def grounding_size(now: Metrics, start: Metrics) -> float | None:
 def swap_blindness(now: Metrics, start: Metrics) -> float | None:
     """F4: accuracy lost under noise, less that lost under another object's touch; needs the controls of R_tu."""
     del start
-    controls = _controls(now)
-    return controls["order"] - controls["noise"] if {"order", "noise"} <= set(controls) else None
+    leads = _leads(now)
+    return leads["noise"] - leads["order"] if {"order", "noise"} <= set(leads) else None
 
 
 def cancelled_bonus(now: Metrics, start: Metrics) -> float | None:
@@ -107,17 +107,17 @@ def cancelled_bonus(now: Metrics, start: Metrics) -> float | None:
 def unearned_credit(now: Metrics, start: Metrics) -> float | None:
     """F6: share of groups with tactile credit, while touch is hardly better than the best control on average."""
     del start
-    controls = _controls(now)
-    if not controls:
+    leads = _leads(now)
+    if not leads:
         return None
-    lead = now["touch_score"] - max(controls.values())
-    return max(now["credit_unearned_share"], now["tactile_credit_share"] if lead <= NO_LEAD else 0.0)
+    chance = min(leads.values()) <= NO_LEAD
+    return max(now["credit_unearned_share"], now["tactile_credit_share"] if chance else 0.0)
 
 
-def _controls(now: Metrics) -> dict[str, float]:
-    """Scores under the controls that apply to most prompts; none where the run has no controls."""
-    names = (name for name in ("drop", "noise", "order") if f"control_{name}" in now)
-    return {name: now[f"control_{name}"] for name in names if now[f"control_{name}_share"] > 0.5}
+def _leads(now: Metrics) -> dict[str, float]:
+    """Leads of touch over the controls that apply to most prompts; none where a run has no controls, or an old log."""
+    names = (name for name in ("drop", "noise", "order") if f"lead_{name}" in now)
+    return {name: now[f"lead_{name}"] for name in names if now[f"control_{name}_share"] > 0.5}
 
 
 def idle_groups(now: Metrics, start: Metrics) -> float | None:
@@ -127,21 +127,25 @@ def idle_groups(now: Metrics, start: Metrics) -> float | None:
     sampling these are shares of all candidates (`drawn_…` in the log), because the selected groups hide those that
     were not selected.
     """
-    drawn = lambda metrics, name: metrics.get(f"drawn_{name}", metrics[name])
-    if "idle_share" not in now or drawn(now, "accuracy") > drawn(start, "accuracy"):  # older logs have none
+    if "idle_share" not in now or _drawn(now, "accuracy") > _drawn(start, "accuracy"):  # older logs have none
         return None
-    unsolved = drawn(now, "unsolved_share")
-    return drawn(now, "idle_share") / unsolved if unsolved > 0 else 0.0
+    unsolved = _drawn(now, "unsolved_share")
+    return _drawn(now, "idle_share") / unsolved if unsolved > 0 else 0.0
+
+
+def _drawn(metrics: Metrics, name: str) -> float:
+    """A metric of all candidates, also under dynamic sampling, which selects groups that are half right at any time."""
+    return metrics.get(f"drawn_{name}", metrics[name])
 
 
 def heavy_tail(now: Metrics, start: Metrics) -> float | None:
     """F8: the largest penalty of a token, β times its KL in units of the advantage, while answers get worse."""
-    return now.get("kl_cost_peak") if now["accuracy"] < start["accuracy"] - WORSE else None
+    return now.get("kl_cost_peak") if _drawn(now, "accuracy") < _drawn(start, "accuracy") - WORSE else None
 
 
 def entropy_collapse(now: Metrics, start: Metrics) -> float | None:
     """F9: entropy relative to the initial one, while answers have not improved and are not all right."""
-    stuck = now["accuracy"] < min(start["accuracy"] + WORSE, 0.95)
+    stuck = _drawn(now, "accuracy") < min(_drawn(start, "accuracy") + WORSE, 0.95)
     return now["entropy"] / max(start["entropy"], 1e-6) if stuck else None
 
 

@@ -12,14 +12,13 @@ HEALTHY = {
     "echo_right": 0.7,
     "accuracy": 0.7,
     "grounding": 0.1,
-    "control_drop": 0.4,
-    "control_noise": 0.4,
-    "control_order": 0.45,
+    "lead_drop": 0.35,
+    "lead_noise": 0.35,
+    "lead_order": 0.3,
     "control_drop_share": 1.0,
     "control_noise_share": 1.0,
     "control_order_share": 1.0,
     "bonus_telling_share": 0.4,
-    "touch_score": 0.75,
     "tactile_credit_share": 0.6,
     "credit_unearned_share": 0.0,
     "bonus_cancelled_share": 0.0,
@@ -44,11 +43,11 @@ FAILURES = [  # each by less than its bound beyond it
     ("F1", {"middle_rate": 0.7}, 0.7 - 1 / 3),
     ("F2", {"echo_share": 0.85, "echo_right": 0.7}, 0.15),
     ("F3", {"grounding": 1.5}, 1.5),
-    ("F4", {"control_noise": 0.1, "control_order": 0.5}, 0.4),
+    ("F4", {"lead_noise": 0.65, "lead_order": 0.25}, 0.4),
     ("F5", {"bonus_cancelled_share": 0.3}, 0.75),
-    ("F6", {"touch_score": 0.4, "tactile_credit_share": 0.3}, 0.3),
+    ("F6", {"lead_drop": -0.05, "tactile_credit_share": 0.3}, 0.3),
     ("F6", {"credit_unearned_share": 0.2}, 0.2),
-    ("F8", {"kl_cost_peak": 1.5, "accuracy": 0.5}, 1.5),
+    ("F8", {"kl_cost_peak": 1.5, "drawn_accuracy": 0.5}, 1.5),
     ("F9", {"entropy": 0.01}, 0.02),
     ("F9", {"entropy": 0.8}, 0.3),
     ("F10", {"grounding_stream_1": 0.0}, 0.0),
@@ -88,8 +87,8 @@ NO_FAILURE = {
     "constant groups, and answers get better": {"drawn_idle_share": 0.4, "drawn_accuracy": 0.75},
     "a lower entropy": {"entropy": 0.035},
     "a stream that counts little": {"grounding_stream_1": 1.5e-7},
-    "low entropy of right answers": {"entropy": 0.01, "accuracy": 0.99},
-    "low entropy of better answers": {"entropy": 0.01, "accuracy": 0.85},
+    "low entropy of right answers": {"entropy": 0.01, "drawn_accuracy": 0.99},
+    "low entropy of better answers": {"entropy": 0.01, "drawn_accuracy": 0.85},
     "a costly token, and answers hold": {"kl_cost_peak": 3.0},
     "honest slots of half of the answers, the others have no format": {"accuracy": 0.35},
     "a bonus that hardly any group earns": {"bonus_telling_share": 0.01, "bonus_cancelled_share": 0.01},
@@ -121,7 +120,7 @@ def test_a_single_batch_without_touch_is_reported_at_once():
 def test_a_score_that_stands_on_some_lines_stops_no_check():
     """As on the steps with a checkpoint: the line that has it may be the first of a window or not."""
     monitor = AlarmMonitor()
-    broken = HEALTHY | {"entropy": 0.0, "accuracy": 0.2}
+    broken = HEALTHY | {"entropy": 0.0, "drawn_accuracy": 0.2}
     for t in range(2 * WINDOW):
         scored = {"held_out": 0.5} if t % 5 == 4 else {}
         alarms = monitor.update((HEALTHY if t < WINDOW else broken) | scored)
@@ -150,26 +149,26 @@ def test_honest_slots_never_agree_oftener_than_they_are_right():
 def test_a_lucky_first_step_is_not_the_beginning():
     """One step of 8 prompts is right by chance in .95 where the policy is in .7."""
     monitor = AlarmMonitor()
-    lucky = HEALTHY | {"accuracy": 0.95}
+    lucky = HEALTHY | {"drawn_accuracy": 0.95}
     costly = HEALTHY | {"kl_cost_peak": 3.0}
     assert all(monitor.update(m) == [] for m in [lucky, *[costly] * (2 * WINDOW)])
 
 
 def test_credit_for_a_lead_that_is_chance_is_unearned():
-    assert set(fired({"touch_score": 0.48})) == {"F6"}
-    assert fired({"touch_score": 0.5}) == {}
+    assert set(fired({"lead_drop": 0.03})) == {"F6"}
+    assert fired({"lead_drop": 0.05}) == {}
 
 
 def test_a_run_without_controls_has_no_alarm_of_them():
     monitor = AlarmMonitor()
-    plain = {name: value for name, value in HEALTHY.items() if not name.startswith(("control", "tactile", "touch"))}
+    plain = {name: value for name, value in HEALTHY.items() if not name.startswith(("control", "lead", "tactile", "touch"))}
     assert all(monitor.update(plain) == [] for _ in range(2 * WINDOW))
 
 
 def test_a_control_that_does_not_apply_says_nothing():
     """A shuffle of what has no order leaves touch as it was."""
-    assert fired({"control_order": 0.75, "control_order_share": 0.0}) == {}
-    assert set(fired({"control_order": 0.75})) == {"F4", "F6"}
+    assert fired({"lead_order": 0.0, "control_order_share": 0.0}) == {}
+    assert set(fired({"lead_order": 0.0})) == {"F4", "F6"}
 
 
 def test_an_alarm_says_what_fired():
