@@ -161,7 +161,9 @@ def test_credit_for_a_lead_that_is_chance_is_unearned():
 
 def test_a_run_without_controls_has_no_alarm_of_them():
     monitor = AlarmMonitor()
-    plain = {name: value for name, value in HEALTHY.items() if not name.startswith(("control", "lead", "tactile", "touch"))}
+    plain = {
+        name: value for name, value in HEALTHY.items() if not name.startswith(("control", "lead", "tactile", "touch"))
+    }
     assert all(monitor.update(plain) == [] for _ in range(2 * WINDOW))
 
 
