@@ -133,8 +133,9 @@ def log_probs(
     fns: PolicyFns, config: GRPOConfig, params: Params, batch: GRPOBatch, rollout: Rollout
 ) -> Float[Array, "P G T"]:
     """Log-probabilities of the sampled tokens under some parameters."""
-    nothing: dict[str, Any] = {"beta": 0.0, "kl_in_reward": False, "gamma": 0.0, "entropy_weight": 0.0, "anchor": 0.0}
-    nothing |= {"learn_conclusion": True}
+    nothing: dict[str, Any] = dict.fromkeys(("beta", "gamma", "entropy_weight", "anchor"), 0.0)
+    nothing |= dict.fromkeys(("grounding_cap_nat", "grounding_budget", "entropy_floor_nat"))
+    nothing |= {"kl_in_reward": False, "learn_conclusion": True}
     algorithm = dataclasses.replace(config.algorithm, **nothing)
     plain = dataclasses.replace(config, algorithm=algorithm)
     each = jnp.ones(rollout.mask.shape[:2])
@@ -180,8 +181,8 @@ def prompt_terms(
 ) -> TokenTerms:
     """Terms of every token of one prompt's group, [G, T], with at most `max_logits` logits of each policy at once.
 
-    At β = 0 the reference is not run, unless conclusions follow it; at γ = 0 the perturbed policy is not run.  With an anchor, the verified answer is
-    one more completion of the policy's group.
+    At β = 0 the reference is not run, unless conclusions follow it, and at γ = 0 the perturbed policy is not run.  With
+    an anchor, the verified answer is one more completion of the policy's group.
 
     Raises:
       ValueError: an anchor, and a batch without answers.
