@@ -127,25 +127,29 @@ def idle_groups(now: Metrics, start: Metrics) -> float | None:
     sampling these are shares of all candidates (`drawn_…` in the log), because the selected groups hide those that
     were not selected.
     """
-    if "idle_share" not in now or _drawn(now, "accuracy") > _drawn(start, "accuracy"):  # older logs have none
+    if "idle_share" not in now or of_candidates(now, "accuracy") > of_candidates(
+        start, "accuracy"
+    ):  # older logs have none
         return None
-    unsolved = _drawn(now, "unsolved_share")
-    return _drawn(now, "idle_share") / unsolved if unsolved > 0 else 0.0
+    unsolved = of_candidates(now, "unsolved_share")
+    return of_candidates(now, "idle_share") / unsolved if unsolved > 0 else 0.0
 
 
-def _drawn(metrics: Metrics, name: str) -> float:
+def of_candidates(metrics: Metrics, name: str) -> float:
     """A metric of all candidates, also under dynamic sampling, which selects groups that are half right at any time."""
     return metrics.get(f"drawn_{name}", metrics[name])
 
 
 def heavy_tail(now: Metrics, start: Metrics) -> float | None:
     """F8: the largest penalty of a token, β times its KL in units of the advantage, while answers get worse."""
-    return now.get("kl_cost_peak") if _drawn(now, "accuracy") < _drawn(start, "accuracy") - WORSE else None
+    return (
+        now.get("kl_cost_peak") if of_candidates(now, "accuracy") < of_candidates(start, "accuracy") - WORSE else None
+    )
 
 
 def entropy_collapse(now: Metrics, start: Metrics) -> float | None:
     """F9: entropy relative to the initial one, while answers have not improved and are not all right."""
-    stuck = _drawn(now, "accuracy") < min(_drawn(start, "accuracy") + WORSE, 0.95)
+    stuck = of_candidates(now, "accuracy") < min(of_candidates(start, "accuracy") + WORSE, 0.95)
     return now["entropy"] / max(start["entropy"], 1e-6) if stuck else None
 
 

@@ -7,6 +7,7 @@ from touchr1_jax.rl.alarms import WINDOW, AlarmMonitor
 
 HEALTHY = {
     "accuracy": 0.6,
+    "drawn_accuracy": 0.6,
     "grounding": 0.1,
     "unsolved_share": 0.8,
     "idle_share": 0.1,
@@ -33,6 +34,7 @@ FAILURES = {
     "A3": ({"all_actions_share": 1.0}, 1.0),
     "A4": ({"first_kind_information": 0.02, "first_kind_peak": 0.5}, 0.02),
     "A5": ({"silent_share": 0.8}, 0.8),
+    "F16": ({"sampler_gap": 0.15}, 0.15),
 }
 
 
@@ -52,7 +54,7 @@ def test_fires_with_its_number(code):
 
 NO_FAILURE = {
     "a healthy run": {},
-    "one touch, and answers are better": {"one_action_share": 1.0, "accuracy": 0.7},
+    "one touch, and answers are better": {"one_action_share": 1.0, "drawn_accuracy": 0.7},
     "one touch of one": {"one_action_share": 1.0, "budget": 1.0},
     "every touch, and time is free": {"all_actions_share": 1.0, "reward_seconds": 0.0},
     "one question": {"first_kind_information": 0.0, "questions": 1.0},
