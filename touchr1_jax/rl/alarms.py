@@ -71,7 +71,7 @@ class AlarmRule:
 def middle_excess(now: Metrics, start: Metrics) -> float:
     """F1: share of middle answers above the share of middle labels, whatever the number of levels."""
     del start
-    return now["middle_rate"] - now["middle_labels"]
+    return of_candidates(now, "middle_rate") - of_candidates(now, "middle_labels")
 
 
 def echo_excess(now: Metrics, start: Metrics) -> float | None:
@@ -81,7 +81,9 @@ def echo_excess(now: Metrics, start: Metrics) -> float | None:
     either direction, agree with probability a² + (1 − a)²/2, which is at most a for every a from ⅓ to 1.
     """
     del start
-    return now["echo_share"] - now["echo_right"] if "echo_right" in now else None  # no line of older logs has it
+    if "echo_right" not in now:  # no line of older logs has it
+        return None
+    return of_candidates(now, "echo_share") - of_candidates(now, "echo_right")
 
 
 def grounding_size(now: Metrics, start: Metrics) -> float | None:
@@ -195,7 +197,7 @@ def frozen_time(now: Metrics, start: Metrics) -> float | None:
 def gamed_answers(now: Metrics, start: Metrics) -> float | None:
     """F13: share of answers that name levels and cannot be read."""
     del start
-    return now["gamed_share"]
+    return of_candidates(now, "gamed_share")
 
 
 def sampler_mismatch(now: Metrics, start: Metrics) -> float | None:

@@ -38,10 +38,15 @@ HEALTHY = {
     "drawn_unsolved_share": 0.5,
     "drawn_idle_share": 0.1,
     "drawn_accuracy": 0.7,
+    "drawn_middle_labels": 1 / 3,
+    "drawn_middle_rate": 0.4,
+    "drawn_echo_share": 0.7,
+    "drawn_echo_right": 0.7,
+    "drawn_gamed_share": 0.05,
 }
 FAILURES = [  # each by less than its bound beyond it
-    ("F1", {"middle_rate": 0.7}, 0.7 - 1 / 3),
-    ("F2", {"echo_share": 0.85, "echo_right": 0.7}, 0.15),
+    ("F1", {"drawn_middle_rate": 0.7}, 0.7 - 1 / 3),
+    ("F2", {"drawn_echo_share": 0.85, "drawn_echo_right": 0.7}, 0.15),
     ("F3", {"grounding": 1.5}, 1.5),
     ("F4", {"lead_noise": 0.65, "lead_order": 0.25}, 0.4),
     ("F5", {"bonus_cancelled_share": 0.3}, 0.75),
@@ -54,7 +59,7 @@ FAILURES = [  # each by less than its bound beyond it
     ("F12", {"static_time_share": 0.015}, 0.015),
     ("F7", {"drawn_idle_share": 0.4, "drawn_accuracy": 0.65}, 0.8),
     ("F10", {"touch_share": 0.0}, 0.0),
-    ("F13", {"gamed_share": 0.3}, 0.3),
+    ("F13", {"drawn_gamed_share": 0.3}, 0.3),
     ("F15", {"nonfinite_share": 0.03}, 0.03),
     ("F15", {"nonfinite_share": 0.03, "drawn_nonfinite_share": 0.0}, 0.03),  # KL in the reward, of the selected alone
     ("F16", {"sampler_gap": 0.15}, 0.15),
