@@ -45,7 +45,7 @@ DECODER = DecoderConfig(
     intermediate_size=48,
     mrope_section=(1, 1, 2),
 )
-TACTILE = TactileViTConfig(sensors=S, width=8, num_layers=0, num_heads=1)
+TACTILE = TactileViTConfig(sensors=S, width=8, num_layers=0, num_heads=1, tokens_per_step=1)
 MODULE = Policy(PolicyConfig(tactile=TACTILE, vision=VisionConfig(image_px=32), decoder=DECODER))
 FNS = PolicyFns.for_layout(MODULE, LAYOUT, TOKENIZER)
 

@@ -151,7 +151,7 @@ def description_policy(shape: PolicyShape) -> DescriptionPolicy:
     asked = [[attribute.name for attribute in LANGUAGE.attributes]]
     layout = build_layout(tokenizer, LANGUAGE, tactile_tokens=shape.contacts * shape.tokens, view_tokens=0, asked=asked)
     config = PolicyConfig(
-        tactile=TactileViTConfig(sensors=1),
+        tactile=TactileViTConfig(sensors=1, tokens_per_step=shape.tokens),
         vision=VisionConfig(),
         decoder=dataclasses.replace(shape.decoder, vocab_size=tokenizer.vocab_size),
     )

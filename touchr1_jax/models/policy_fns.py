@@ -78,6 +78,11 @@ class PolicyFns:
         return int(min([*np.flatnonzero(stream), *self.slots.touch.ravel(), len(stream)]))
 
     @property
+    def step_tokens(self) -> int:
+        """Tactile tokens of a time step."""
+        return self.module.config.tactile.tokens_per_step
+
+    @property
     def touch_starts(self) -> tuple[int, ...]:
         """First prompt token that a change of each stream's touch can change."""
         return tuple(int(row.min()) for row in self.slots.touch)

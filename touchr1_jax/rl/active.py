@@ -175,6 +175,11 @@ class ActiveEngine(GRPOEngine):
         touch = jnp.where(chosen[..., None, None] & tokens, noise, seen.touch)
         return touch, jnp.zeros(len(touch), jnp.int32)
 
+    def answered(self, group: Group) -> dict[str, Array]:
+        """None: these answers are a conclusion alone."""
+        del group
+        return {}
+
     def metrics(self, group: Group, learn: Experience) -> dict[str, Array]:
         """Size of the advantages, and share of prompts in which anything was observed."""
         seen = cast(Explored, group.batch.features)

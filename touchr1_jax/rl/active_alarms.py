@@ -3,9 +3,9 @@
 The rules and bounds work as those of `alarms`, on the metrics of `active.exploration_metrics`.
 """
 
-from touchr1_jax.rl.alarms import RULES, AlarmRule, Metrics
+from touchr1_jax.rl.alarms import RULES, AlarmRule, Metrics, of_candidates
 
-SHARED = ("F3", "F7", "F8", "F9", "F10", "F15")
+SHARED = ("F3", "F7", "F8", "F9", "F10", "F15", "F16")
 """Codes of the rules of `alarms` that hold for trajectories too."""
 
 
@@ -17,7 +17,7 @@ def untouched_share(now: Metrics, start: Metrics) -> float | None:
 
 def single_share(now: Metrics, start: Metrics) -> float | None:
     """Share of trajectories with one action although several are allowed, while answers do not improve."""
-    several = now["budget"] > 1 and now["accuracy"] <= start["accuracy"]
+    several = now["budget"] > 1 and of_candidates(now, "accuracy") <= of_candidates(start, "accuracy")
     return now["one_action_share"] if several else None
 
 

@@ -71,7 +71,7 @@ class AlarmRule:
 def middle_excess(now: Metrics, start: Metrics) -> float:
     """F1: share of middle answers above the share of middle labels, whatever the number of levels."""
     del start
-    return now["middle_rate"] - now["middle_labels"]
+    return of_candidates(now, "middle_rate") - of_candidates(now, "middle_labels")
 
 
 def echo_excess(now: Metrics, start: Metrics) -> float | None:
@@ -81,7 +81,9 @@ def echo_excess(now: Metrics, start: Metrics) -> float | None:
     either direction, agree with probability a² + (1 − a)²/2, which is at most a for every a from ⅓ to 1.
     """
     del start
-    return now["echo_share"] - now["echo_right"] if "echo_right" in now else None  # no line of older logs has it
+    if "echo_right" not in now:  # no line of older logs has it
+        return None
+    return of_candidates(now, "echo_share") - of_candidates(now, "echo_right")
 
 
 def grounding_size(now: Metrics, start: Metrics) -> float | None:
@@ -93,8 +95,8 @@ def grounding_size(now: Metrics, start: Metrics) -> float | None:
 def swap_blindness(now: Metrics, start: Metrics) -> float | None:
     """F4: accuracy lost under noise, less that lost under another object's touch; needs the controls of R_tu."""
     del start
-    controls = _controls(now)
-    return controls["order"] - controls["noise"] if {"order", "noise"} <= set(controls) else None
+    leads = _leads(now)
+    return leads["noise"] - leads["order"] if {"order", "noise"} <= set(leads) else None
 
 
 def cancelled_bonus(now: Metrics, start: Metrics) -> float | None:
@@ -107,40 +109,49 @@ def cancelled_bonus(now: Metrics, start: Metrics) -> float | None:
 def unearned_credit(now: Metrics, start: Metrics) -> float | None:
     """F6: share of groups with tactile credit, while touch is hardly better than the best control on average."""
     del start
-    controls = _controls(now)
-    if not controls:
+    leads = _leads(now)
+    if not leads:
         return None
-    lead = now["touch_score"] - max(controls.values())
-    return max(now["credit_unearned_share"], now["tactile_credit_share"] if lead <= NO_LEAD else 0.0)
+    chance = min(leads.values()) <= NO_LEAD
+    return max(now["credit_unearned_share"], now["tactile_credit_share"] if chance else 0.0)
 
 
-def _controls(now: Metrics) -> dict[str, float]:
-    """Scores under the controls that apply to most prompts; none where the run has no controls."""
-    names = (name for name in ("drop", "noise", "order") if f"control_{name}" in now)
-    return {name: now[f"control_{name}"] for name in names if now[f"control_{name}_share"] > 0.5}
+def _leads(now: Metrics) -> dict[str, float]:
+    """Leads of touch over the controls that apply to most prompts; none where a run has no controls, or an old log."""
+    names = (name for name in ("drop", "noise", "order") if f"lead_{name}" in now)
+    return {name: now[f"lead_{name}"] for name in names if now[f"control_{name}_share"] > 0.5}
 
 
 def idle_groups(now: Metrics, start: Metrics) -> float | None:
-    """F7: share of groups of equal rewards among those that are not all right, while answers do not improve.
+    """F7: share of groups of equal rewards among those that are not solved yet, while answers do not improve.
 
-    A group that is all right has nothing to learn.  Under dynamic sampling these are shares of all candidates
-    (`drawn_…` in the log), because the selected groups hide those that were not selected.
+    A group that is all right has nothing to learn, and alarm F15 counts those that are left out.  Under dynamic
+    sampling these are shares of all candidates (`drawn_…` in the log), because the selected groups hide those that
+    were not selected.
     """
-    drawn = lambda metrics, name: metrics.get(f"drawn_{name}", metrics[name])
-    if drawn(now, "accuracy") > drawn(start, "accuracy"):
+    if "idle_share" not in now or of_candidates(now, "accuracy") > of_candidates(
+        start, "accuracy"
+    ):  # older logs have none
         return None
-    solved = drawn(now, "all_right_share")
-    return (drawn(now, "degenerate_share") - solved) / (1 - solved) if solved < 1 else 0.0
+    unsolved = of_candidates(now, "unsolved_share")
+    return of_candidates(now, "idle_share") / unsolved if unsolved > 0 else 0.0
+
+
+def of_candidates(metrics: Metrics, name: str) -> float:
+    """A metric of all candidates, also under dynamic sampling, which selects groups that are half right at any time."""
+    return metrics.get(f"drawn_{name}", metrics[name])
 
 
 def heavy_tail(now: Metrics, start: Metrics) -> float | None:
     """F8: the largest penalty of a token, β times its KL in units of the advantage, while answers get worse."""
-    return now.get("kl_cost_peak") if now["accuracy"] < start["accuracy"] - WORSE else None
+    return (
+        now.get("kl_cost_peak") if of_candidates(now, "accuracy") < of_candidates(start, "accuracy") - WORSE else None
+    )
 
 
 def entropy_collapse(now: Metrics, start: Metrics) -> float | None:
     """F9: entropy relative to the initial one, while answers have not improved and are not all right."""
-    stuck = now["accuracy"] < min(start["accuracy"] + WORSE, 0.95)
+    stuck = of_candidates(now, "accuracy") < min(of_candidates(start, "accuracy") + WORSE, 0.95)
     return now["entropy"] / max(start["entropy"], 1e-6) if stuck else None
 
 
@@ -186,7 +197,7 @@ def frozen_time(now: Metrics, start: Metrics) -> float | None:
 def gamed_answers(now: Metrics, start: Metrics) -> float | None:
     """F13: share of answers that name levels and cannot be read."""
     del start
-    return now["gamed_share"]
+    return of_candidates(now, "gamed_share")
 
 
 def sampler_mismatch(now: Metrics, start: Metrics) -> float | None:

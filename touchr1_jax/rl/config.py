@@ -5,7 +5,7 @@ A preset is a dataclass of its own, so that the command line can choose it: `…
 
 import dataclasses
 import enum
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -162,11 +162,6 @@ class Algorithm:
             raise ValueError(f"{field} is {getattr(self, field)}: must go for PER_REWARD, whose σ takes {weight} away")
         if self.segment_credit and self.surrogate is Surrogate.SEQUENCE:  # its gradient is that of the credits' mean
             raise ValueError("segment_credit is True: must be False for surrogate SEQUENCE, one ratio; change either")
-        idle = ("learn_conclusion", "enumerated"), ("importance_sequence", "importance_cap"), ("kl_in_reward", "beta")
-        for field, needed in (*idle, ("reference_share", "reference_every")):
-            value, need = getattr(self, field), getattr(self, needed)
-            if value != getattr(type(self), field) and (need is None or left_out(need)):
-                raise ValueError(f"{field} is {value}, but {needed} is {need}: set it or drop {field}")
         at_least(self, 0, "stale", "score_centering")
         if not 0 < self.reference_share <= 1:
             raise ValueError(f"reference_share is {self.reference_share}: must lie in 0 < share ≤ 1; 1 is no average")
@@ -178,6 +173,13 @@ class Algorithm:
         for field in bounds.split():
             if (bound := getattr(self, field)) is not None and not bound > 0:
                 raise ValueError(f"{field} is {bound}: must be above 0; None leaves it out")
+        idle = {"learn_conclusion": "enumerated", "importance_sequence": "importance_cap", "kl_in_reward": "beta"}
+        idle |= {"grounding_cap_nat": "gamma", "grounding_budget": "gamma", "entropy_floor_nat": "entropy_weight"}
+        idle |= {"tactile_margin": "tactile_use", "reference_share": "reference_every"}
+        for field, needed in idle.items():
+            value, need = getattr(self, field), getattr(self, needed)
+            if left_out(need) and value not in (None, getattr(type(self), field)):
+                raise ValueError(f"{field} is {value}, but {needed} is {need}: set it or drop {field}")
 
 
 def ratio_to_learner(algorithm: Algorithm) -> bool:
@@ -193,9 +195,9 @@ def loss_beta(algorithm: Algorithm) -> float:
     return 0.0 if algorithm.kl_in_reward else algorithm.beta
 
 
-def left_out(weight: float | jax.Array) -> bool:
-    """True for a term that is not computed: its weight is the number 0, not an array that may have another value."""
-    return not isinstance(weight, jax.Array) and weight == 0.0
+def left_out(weight: Any) -> bool:
+    """True for a term that is off, or whose weight is the number 0, not an array that may have another value."""
+    return not isinstance(weight, jax.Array) and weight in (0.0, None, TactileUse.OFF)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -238,8 +240,7 @@ class Stable(Algorithm):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Dapo(Algorithm):
-    """DAPO (arXiv 2503.14476): clip .2/.28, mean over tokens, dynamic sampling, no KL; its length penalty is the reward
-    `overlong`."""
+    """DAPO (arXiv 2503.14476): clip .2/.28, mean over tokens, dynamic sampling, no KL; the reward `overlong` is its."""
 
     clip_high: float = 0.28
     average: Average = Average.TOKEN

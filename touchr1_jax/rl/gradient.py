@@ -133,7 +133,9 @@ def log_probs(
     fns: PolicyFns, config: GRPOConfig, params: Params, batch: GRPOBatch, rollout: Rollout
 ) -> Float[Array, "P G T"]:
     """Log-probabilities of the sampled tokens under some parameters."""
-    nothing: dict[str, Any] = {"beta": 0.0, "kl_in_reward": False, "gamma": 0.0, "entropy_weight": 0.0, "anchor": 0.0}
+    nothing: dict[str, Any] = dict.fromkeys(("beta", "gamma", "entropy_weight", "anchor"), 0.0)
+    nothing |= dict.fromkeys(("grounding_cap_nat", "grounding_budget", "entropy_floor_nat"))
+    nothing |= {"kl_in_reward": False, "learn_conclusion": True}
     algorithm = dataclasses.replace(config.algorithm, **nothing)
     plain = dataclasses.replace(config, algorithm=algorithm)
     each = jnp.ones(rollout.mask.shape[:2])
@@ -179,8 +181,8 @@ def prompt_terms(
 ) -> TokenTerms:
     """Terms of every token of one prompt's group, [G, T], with at most `max_logits` logits of each policy at once.
 
-    At β = 0 the reference is not run, at γ = 0 the perturbed policy is not run.  With an anchor, the verified answer is
-    one more completion of the policy's group.
+    At β = 0 the reference is not run, unless conclusions follow it, and at γ = 0 the perturbed policy is not run.  With
+    an anchor, the verified answer is one more completion of the policy's group.
 
     Raises:
       ValueError: an anchor, and a batch without answers.
@@ -196,7 +198,7 @@ def prompt_terms(
     rows: Rows = {"own": own, "token": tokens}
     if algorithm.score_centering and experience.rollout.head_ids is not None:
         rows["head"] = jnp.moveaxis(experience.rollout.head_ids, -2, -1)
-    if not left_out(loss_beta(algorithm)):
+    if not (left_out(loss_beta(algorithm)) and algorithm.learn_conclusion):
         rows["reference"] = jax.lax.stop_gradient(states(reference, batch.features)[0])
     if not left_out(algorithm.gamma):
         rows["perturbed"] = perturbed_states(fns, config, params, experience, prefix)

@@ -216,7 +216,8 @@ class GRPOEngine:
             asked, label = group.batch.target.asked[0], group.batch.target.label[0]
             sample[SAMPLE] = StepSample(asked, label, group.rollout.tokens[0, 0], group.reward[0, 0])
         if self.config.algorithm.candidates > 1:
-            metrics |= {f"drawn_{name}": value for name, value in self.group_metrics(group).items()}
+            drawn = self.group_metrics(group) | self.answered(group)
+            metrics |= {f"drawn_{name}": value for name, value in drawn.items()}
             rows = dynamic_sampling_rows(self.no_signal(group), self.config.prompts)
             group = jax.tree.map(lambda x: x[rows], group)
         reference = frozen.reference if state.reference is None else state.reference
@@ -230,7 +231,7 @@ class GRPOEngine:
         params, opt_state, parts = update_policy(
             self.fns, self.optimizer, self.config, state.params, state.opt_state, reference, learn
         )
-        metrics |= parts | self.group_metrics(group) | self.metrics(group, learn)
+        metrics |= parts | self.group_metrics(group) | self.answered(group) | self.metrics(group, learn)
         step, behind = state.step + 1, (*state.behind, state.params)[1:]
         after = dataclasses.replace(state, params=params, opt_state=opt_state, step=step, behind=behind)
         return self.refreshed(after), {**metrics, **sample}
@@ -357,19 +358,22 @@ class GRPOEngine:
 
     def group_metrics(self, group: Group) -> dict[str, Array]:
         """Metrics of rollouts and rewards; with dynamic sampling, of all candidates and of the selected ones."""
-        target = group.batch.target
+        target, no_signal = group.batch.target, self.no_signal(group)
         right = jax.vmap(jax.vmap(tactile_use.right, in_axes=(0, None)))(group.parsed, target)
         return {
-            **reward_metrics(group.terms, right, group.finite),
-            **rollout_metrics(group.rollout, group.reward, self.no_signal(group), group.finite, group.parsed, target),
+            **reward_metrics(group.terms, right, no_signal, group.finite),
+            **rollout_metrics(group.rollout, group.reward, no_signal, group.finite, group.parsed, target),
         }
 
+    def answered(self, group: Group) -> dict[str, Array]:
+        """Metrics of the answers, also of all candidates: no group whose answers are all alike is selected."""
+        return answer_metrics(group.parsed, group.batch.target, ordinal_levels(self.score))
+
     def metrics(self, group: Group, learn: Experience) -> dict[str, Array]:
-        """Metrics of the selected groups alone: their answers, advantages, bonuses and touch."""
+        """Metrics of the selected groups alone: their advantages, bonuses and touch."""
         algorithm, reward = self.config.algorithm, group.reward
         return {
-            **answer_metrics(group.parsed, group.batch.target, ordinal_levels(self.score)),
             **advantage_metrics(reward, learn.advantage),
             **tactile_use.bonus_metrics(algorithm, reward, group.terms, group.bonus, learn.advantage, group.finite),
-            **touch_metrics(group.batch.features),
+            **touch_metrics(group.batch.features, self.fns.step_tokens),
         }

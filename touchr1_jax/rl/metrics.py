@@ -78,13 +78,23 @@ def _mode_share(level: Int[Array, "P G A"], counted: Bool[Array, "P G A"]) -> Ar
 
 
 def reward_metrics(
-    terms: Mapping[str, Float[Array, "P G"]], right: Bool[Array, "P G"], finite: Bool[Array, "P"]
+    terms: Mapping[str, Float[Array, "P G"]],
+    right: Bool[Array, "P G"],
+    no_signal: Bool[Array, "P"],
+    finite: Bool[Array, "P"],
 ) -> dict[str, Array]:
-    """Mean of each term, shares of groups whose answers are all right or all wrong, and of groups left out."""
+    """Mean of each term; shares of groups whose answers are all right or all wrong, and of groups left out.
+
+    `unsolved_share` is the share of groups that are neither all right nor left out, `idle_share` that of those among
+    them without signal.
+    """
+    unsolved = finite & ~jnp.all(right, -1)
     return {
         **{f"reward_{name}": masked.mean(value, finite[:, None]) for name, value in terms.items()},
         "all_right_share": jnp.mean(jnp.all(right, -1)),
         "none_right_share": jnp.mean(~jnp.any(right, -1)),
+        "unsolved_share": jnp.mean(unsolved),
+        "idle_share": jnp.mean(unsolved & no_signal),
         "nonfinite_share": jnp.mean(~finite),
     }
 
@@ -98,12 +108,12 @@ def advantage_metrics(reward: Float[Array, "P G"], advantage: Float[Array, "P G"
     }
 
 
-def touch_metrics(features: Features) -> dict[str, Array]:
-    """`static_time_share`: share of streams with several steps whose time ids are all equal; `touch_share`: share of
-    prompts with any touch.
+def touch_metrics(features: Features, step_tokens: int) -> dict[str, Array]:
+    """`static_time_share`: share of streams with several steps, of `step_tokens` each, whose time ids are all equal;
+    `touch_share`: share of prompts with any touch.
     """
     time, there = features.touch_time, features.touch_time >= 0
-    several = features.stream_mask & (jnp.sum(there, -1) > 1)
+    several = features.stream_mask & (jnp.sum(there, -1) > step_tokens)
     low = masked.minimum(time, there, -1, empty=0.0)
     high = masked.maximum(time, there, -1, empty=0.0)
     return {

@@ -282,11 +282,12 @@ def draw_token(logits: Float[Array, "P G V"], key: Array, config: SampleConfig) 
 
 
 def inverse_draw(logits: Float[Array, "*n V"], uniform: Float[Array, "*n"]) -> Int[Array, "*n"]:
-    """Number of words whose cumulative probability does not exceed u: word v with probability softmax(logits)_v.
+    """The first word whose cumulative probability exceeds u: word v with probability softmax(logits)_v.
 
-    u is scaled by the cumulative sum, not by 1, so that rounding never selects a word of weight 0 at the end.
+    A word of weight 0 is never drawn.  Rounding alone would draw some: a compiled cumulative sum adds in an order of
+    its own for each word, and so rises and falls by 1e-7 where nothing is added.
     """
     weight = jnp.exp(logits - jnp.max(logits, -1, keepdims=True))
-    total = jnp.cumsum(weight, -1)
-    drawn = jnp.sum(total <= uniform[..., None] * total[..., -1:], -1)
-    return drawn.astype(jnp.int32)
+    total = jnp.where(weight > 0, jnp.cumsum(weight, -1), 0.0)
+    exceeds = total > uniform[..., None] * jnp.max(total, -1, keepdims=True)
+    return jnp.argmax(exceeds, -1).astype(jnp.int32)

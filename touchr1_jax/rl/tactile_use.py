@@ -43,6 +43,8 @@ def tactile_bonus(
 ) -> tuple[Float[Array, "P G"], dict[str, Array]]:
     """Bonus m of each rollout, and metrics of the controls.
 
+    `lead_NAME` is the lead of touch over a control in the prompts to which that applies; `touch_score` is of all.
+
     Args:
       algorithm: literal or recommended, δ.
       parsed: the rollouts' answers.
@@ -65,8 +67,10 @@ def tactile_bonus(
         bonus = jax.vmap(literal, in_axes=(0, 0, 0, None))(own, best, is_right, algorithm.tactile_margin)
     else:
         bonus = jax.vmap(recommended, in_axes=(0, 0, 0, None))(own, best, parsed.formatted, algorithm.tactile_margin)
+    lead = jnp.mean(own, -1, keepdims=True) - jnp.mean(by_prompt, -1)
     return bonus, {
         "touch_score": jnp.mean(own),
+        **{f"lead_{n}": masked.mean(lead[:, i], applies[:, i]) for i, n in enumerate(CONTROLS)},
         **{f"control_{n}": masked.mean(by_prompt[:, i], applies[:, i, None]) for i, n in enumerate(CONTROLS)},
         **{f"control_{n}_share": jnp.mean(applies[:, i]) for i, n in enumerate(CONTROLS)},
         "tactile_credit_share": jnp.mean(jnp.any(bonus > 0, -1)),

@@ -9,7 +9,8 @@ import pytest
 
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.rl import reference
-from touchr1_jax.rl.config import GRPOConfig, Paper, Surrogate
+from touchr1_jax.rl.config import GRPOConfig, Norm, Paper, Surrogate
+from touchr1_jax.rl.enumerated import LevelRewards
 from touchr1_jax.rl.gradient import Experience, grpo_gradient, prompt_terms
 from touchr1_jax.rl.losses import token_log_probs
 from touchr1_jax.types import Rollout
@@ -133,6 +134,19 @@ def test_an_anchor_adds_the_likelihood_of_the_answers_and_its_gradient(experienc
         np.testing.assert_allclose(a, plain - 0.7 * more, atol=1e-5 * scale)
     with pytest.raises(ValueError, match="anchor is above 0, but the batch holds no verified answers"):
         gradient(anchored)(experience)
+
+
+@pytest.mark.long
+def test_levels_that_are_not_learned_follow_the_reference_without_kl_too(experience):
+    """At β = 0 the gradient is that of the least β; the KL of no other token is in it, and none is logged."""
+    ids, at = jnp.arange(3, 6), jnp.ones((P, G), jnp.int32)
+    levels = LevelRewards(jnp.tile(ids, (P, 1)), at, jnp.zeros((P, G, 3)), jnp.zeros((P, G)))
+    algorithm = Paper(gamma=0.0, enumerated=Norm.NONE, learn_conclusion=False)
+    of = lambda beta: dataclasses.replace(CONFIG, algorithm=dataclasses.replace(algorithm, beta=beta))
+    (found, parts, _), (least, _, _) = (gradient(of(beta))(experience._replace(levels=levels)) for beta in (0.0, 1e-12))
+    assert max(float(np.abs(g).max()) for g in jax.tree.leaves(least)) > 1e-3
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), found, least)
+    assert "kl" not in parts
 
 
 @pytest.mark.long

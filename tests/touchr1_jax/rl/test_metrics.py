@@ -94,17 +94,20 @@ def test_answer_metrics_by_hand():
 def test_metrics_of_rewards_and_advantages_by_hand():
     reward = jnp.array([[1.0, 0.0], [0.5, 0.25], [0.4, 0.4], [0.0, 0.0]])
     right = jnp.array([[True, True], [True, False], [False, False], [False, False]])
-    found = reward_metrics({"a": reward}, right, jnp.array([True, True, True, False]))
+    found = reward_metrics({"a": reward}, right, *jnp.array([[False, False, True, True], [True, True, True, False]]))
     expected = {"reward_a": 2.55 / 6, "all_right_share": 0.25, "none_right_share": 0.5, "nonfinite_share": 0.25}
-    assert_metrics(found, expected)
+    assert_metrics(found, expected | {"unsolved_share": 0.5, "idle_share": 0.25})
     advantage = jnp.array([[1.0, -3.0], [2.0, -2.0], [0.0, 0.0], [0.0, 0.0]])
     expected = {"advantage_abs": 1.0, "advantage_peak": 3.0, "lively_groups": 2.0}
     assert_metrics(advantage_metrics(reward, advantage), expected)
 
 
 def test_touch_metrics_by_hand():
-    """One of two present streams of several steps stands still; prompt 2 has no touch."""
+    """One of two present streams of several steps stands still; prompt 2 has no touch.  One step of two tokens is no
+    stream of several steps.
+    """
     time = jnp.array([[[3, 3, -1], [1, 2, 2]], [[5, -1, -1], [0, 0, 0]], [[0, 0, 0], [0, 0, 0]]])
     present = jnp.array([[True, True], [True, False], [False, False]])
     features = tiny.features(0, 3).replace(touch_time=time, stream_mask=present)
-    assert_metrics(touch_metrics(features), {"static_time_share": 0.5, "touch_share": 2 / 3})
+    assert_metrics(touch_metrics(features, 1), {"static_time_share": 0.5, "touch_share": 2 / 3})
+    assert_metrics(touch_metrics(features, 2), {"static_time_share": 0.0, "touch_share": 2 / 3})

@@ -386,6 +386,10 @@ def test_metrics_of_minibatches_count_prompts_and_weigh_streams_by_them():
         ({"reference_share": 0.0, "reference_every": 2}, "reference_share is 0.0: must lie in 0 < share ≤ 1"),
         ({"reference_share": 0.5}, "reference_share is 0.5, but reference_every is None: set it"),
         ({"importance_sequence": True}, "importance_sequence is True, but importance_cap is None: set it"),
+        ({"grounding_cap_nat": 1.0, "gamma": 0.0}, "grounding_cap_nat is 1.0, but gamma is 0.0: set it or drop"),
+        ({"grounding_budget": 0.05, "gamma": 0.0}, "grounding_budget is 0.05, but gamma is 0.0: set it or drop"),
+        ({"entropy_floor_nat": 0.1}, "entropy_floor_nat is 0.1, but entropy_weight is 0.0: set it or drop"),
+        ({"tactile_margin": 0.2}, "tactile_margin is 0.2, but tactile_use is TactileUse.OFF: set it or drop"),
         ({"kl_in_reward": True, "beta": 0.0}, "kl_in_reward is True, but beta is 0.0: set it or drop kl_in_reward"),
         ({"kl_in_reward": True, "advantage": Advantage.PER_REWARD}, "kl_in_reward is True: must go .* takes beta away"),
         (

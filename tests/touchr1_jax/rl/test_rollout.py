@@ -123,6 +123,21 @@ def test_inverse_draws_by_hand():
     np.testing.assert_array_equal(inverse_draw(jnp.tile(logits, (6, 1)), u), [0, 1, 2, 2, 4, 4])
 
 
+def test_inverse_draws_hit_no_word_of_weight_0_whatever_the_order_of_the_sum():
+    """A compiled cumulative sum of 40,000 words is not monotone; u stands where it rises at a word of weight 0."""
+    rng = np.random.default_rng(0)
+    logits = np.where(rng.random(40_000) < 0.5, -np.inf, 4 * rng.normal(size=40_000)).astype(np.float32)
+    weight = np.exp(logits - logits.max())
+    total = np.asarray(jax.jit(jnp.cumsum)(weight))
+    rises = np.flatnonzero((np.diff(total) > 0) & (weight[1:] == 0))
+    assert len(rises) > 100
+    u = np.concatenate([total[rises] / total[-1], [0.0, 1 - 2**-23]]).astype(np.float32)
+    drawn = jax.jit(jax.vmap(inverse_draw, in_axes=(None, 0)))(logits, u)
+    assert np.isfinite(logits[drawn]).all()
+    exact = np.cumsum(weight, dtype=np.float64)
+    np.testing.assert_allclose(exact[drawn] / exact[-1], u, atol=weight.max() / exact[-1])
+
+
 def test_settings_of_the_sampler_never_change():
     with pytest.raises(dataclasses.FrozenInstanceError):
         CONFIG.greedy = False

@@ -109,8 +109,12 @@ def test_bonuses_and_their_metrics_by_hand():
     shares = {"touch_score": third, "tactile_credit_share": third}
     shares |= {"control_missing_share": 0, "credit_unearned_share": 0}
     for name in ("drop", "noise", "order"):
-        shares |= {f"control_{name}": 0, f"control_{name}_share": 1}
+        shares |= {f"control_{name}": 0, f"control_{name}_share": 1, f"lead_{name}": third}
     assert metrics == shares
+    # without touch in the last group, its answers are compared with none
+    touched = batch.features.replace(stream_mask=batch.features.stream_mask.at[2].set(False))
+    _, metrics = tactile_bonus(Stable(), rollouts, batch.replace(features=touched), noise, answer, jax.random.key(0))
+    assert (metrics["lead_drop"], metrics["touch_score"]) == (0.5, third)
 
 
 @pytest.mark.long
