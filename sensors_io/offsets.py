@@ -63,7 +63,7 @@ class Offsets:
         try:
             tree = read_json(path)
             sensors = {str(name): Offset(**offset) for name, offset in tree["sensors"].items()}
-            late_s = [float(offset.late_s) for offset in sensors.values()]
+            late_s = [offset.late_s for offset in sensors.values()]
             if not all(abs(late) <= LARGEST_S for late in late_s):
                 raise ValueError(f"late_s are {late_s}: must lie within ±{LARGEST_S} s")
             return cls(reference=str(tree["reference"]), sensors=sensors)

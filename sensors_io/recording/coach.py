@@ -104,12 +104,16 @@ class Coach:
         self._phase = Phase.APPROACH
         self._since_ns = 0
         self._tapped = 0
+        self._normal = 0.0
         self._done = self._complete = False
 
     def step(self, time_ns: int, force_n: np.ndarray) -> Advice:
-        """Take one force [3] on the gel into account."""
-        normal = -float(force_n[2])
-        if not self._armed:
+        """Take one force [3] on the gel into account; one that is not finite is none, and changes nothing."""
+        finite = bool(np.isfinite(force_n).all())
+        normal = self._normal = -float(force_n[2]) if finite else self._normal
+        if not finite:
+            pass
+        elif not self._armed:
             self._arm(time_ns, normal)
         elif not self._done:
             self._advance(time_ns, normal)
@@ -205,6 +209,6 @@ class FreeCoach:
             recording=left_s > 0,
             done=left_s <= 0,
             complete=True,
-            normal_n=-float(force_n[2]),
+            normal_n=-float(np.nan_to_num(force_n[2])),
             target_n=0.0,
         )

@@ -236,7 +236,7 @@ class _Session:
     def _measured(self, samples: list[Sample], journal: JournalWriter) -> tuple[np.ndarray, np.ndarray]:
         """Readings of the force sensor, compensated, in the gel's frame; journaled."""
         times = np.array([s.host_time_ns for s in samples], np.int64)
-        force, moment = _stacked(samples, "force_n"), _stacked(samples, "moment_nmm")
+        force, moment = _stacked(samples, "force_n"), _stacked(samples, "moment_nmm", lacking=0.0)
         beyond = np.array([bool(s.arrays.get("out_of_range", False)) for s in samples], bool)
         if self._config.gravity is not None:
             force, moment = self._config.gravity.contact(force, moment, self._config.down)
@@ -273,6 +273,6 @@ class _Session:
         )
 
 
-def _stacked(samples: list[Sample], name: str) -> np.ndarray:
-    """A vector of every sample, float64 [n, 3]; 0 where one lacks it."""
-    return np.array([s.arrays.get(name, np.zeros(3)) for s in samples], np.float64).reshape(-1, 3)
+def _stacked(samples: list[Sample], name: str, lacking: float = np.nan) -> np.ndarray:
+    """A vector of every sample, float64 [n, 3]; `lacking` where one has none."""
+    return np.array([s.arrays.get(name, np.full(3, lacking)) for s in samples], np.float64).reshape(-1, 3)

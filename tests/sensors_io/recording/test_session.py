@@ -211,11 +211,14 @@ def test_a_device_that_fails_for_good_leaves_its_contact_in_the_records(tmp_path
     assert [(k.motion, k.trial) for k in store.contacts] == [("press", 0), ("press", 1), ("slide_x", 0)]
 
 
-def test_a_gap_of_the_camera_is_flagged(tmp_path):
+@pytest.mark.parametrize("then", [41, 0])
+def test_a_gap_of_the_camera_is_flagged(tmp_path, then):
+    """Also that of one that was lost, and counts from the beginning again."""
+
     class Gappy(Camera):
         def drain(self):
             if self.count == 40:
-                self.count += 1
+                self.count = then
             return super().drain()
 
     hand = Hand()
