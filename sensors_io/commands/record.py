@@ -104,6 +104,8 @@ class Record(Bench):
             stop = stack.enter_context(stop_on_interrupt())
             tactile = stack.enter_context(readers(parts.tactile))
             force = stack.enter_context(readers((parts.force,) if parts.force else ()))
+            if self.sync is not None:
+                Offsets.load(self.sync).require([device.identity.sensor for device in (*tactile, *force)], self.sync)
             view = None if parts.view is None else self.look(parts.view)
             board = _Board()
             show = stack.enter_context(board.shown())

@@ -96,6 +96,9 @@ class UvcConfig:
             )
         if bool(self.frame_width) != bool(self.frame_height):
             raise ValueError("frame_width and frame_height must both be given, or neither; give the other one")
+        for name in ("width", "height", "frame_width", "frame_height", "rate_hz"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} is {getattr(self, name)}: must be ≥ 0; 0 keeps the camera's own")
         if self.mm_per_px is not None and not self.mm_per_px > 0:
             raise ValueError(f"mm_per_px is {self.mm_per_px}: must be > 0; measure it with `geometry`")
 

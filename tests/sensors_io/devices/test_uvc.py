@@ -169,6 +169,12 @@ def test_the_cameras_of_one_device_are_told_apart_by_their_interfaces(tmp_path):
     refused(DeviceNotFoundError, "interface 7: no camera", lambda: UvcConfig(product="D435", interface=7).choose(found))
 
 
+@pytest.mark.parametrize("name", ["width", "height", "frame_width", "frame_height", "rate_hz"])
+def test_negative_sizes_are_refused(name):
+    sizes = {"frame_width": 8, "frame_height": 8} | {name: -1}
+    refused(ValueError, f"{name} is -1: must be ≥ 0", UvcConfig, **sizes)
+
+
 def test_configs_are_checked():
     refused(ValueError, "border_share is 0.5", UvcConfig, border_share=0.5)
     refused(ValueError, "must have four letters", UvcConfig, pixel_format="MJPEG")
