@@ -107,6 +107,11 @@ class Coach:
         self._normal = 0.0
         self._done = self._complete = False
 
+    @property
+    def begun(self) -> bool:
+        """True from the first touch on."""
+        return self._phase != Phase.APPROACH or self._tapped > 0 or self._done
+
     def step(self, time_ns: int, force_n: np.ndarray) -> Advice:
         """Take one force [3] on the gel into account; one that is not finite is none, and changes nothing."""
         finite = bool(np.isfinite(force_n).all())
@@ -198,6 +203,7 @@ class FreeCoach:
     def __init__(self, seconds: float):
         self._seconds = seconds
         self._start_ns: int | None = None
+        self.begun = True
 
     def step(self, time_ns: int, force_n: np.ndarray) -> Advice:
         """Take one moment into account; `force_n` is shown only."""
