@@ -28,7 +28,7 @@ import cv2
 import numpy as np
 
 from sensors_io.devices import bridge_server
-from sensors_io.devices.base import Identity, Sample
+from sensors_io.devices.base import Identity, Sample, require_pitch
 from sensors_io.devices.errors import DeviceDataError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
 from sensors_io.errors import MALFORMED
 from sensors_io.schema import FRAME_ARRAYS
@@ -70,6 +70,9 @@ class BridgeConfig:
     rate_hz: float = 0.0
     wait_s: float = 60.0
     mm_per_px: float | None = None
+
+    def __post_init__(self) -> None:
+        require_pitch(self.mm_per_px)
 
     def open(self) -> "Bridge":
         """The device, not open yet."""

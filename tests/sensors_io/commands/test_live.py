@@ -191,6 +191,13 @@ def test_a_camera_of_the_object_refuses_numbers_while_the_command_is_read(wrong,
     assert f"{wrong.split()[0][2:].replace('-', '_').replace('colour', 'pixel')} is" in capsys.readouterr().err
 
 
+def test_where_a_contact_shows_needs_a_camera_that_shows_it(tmp_path, press, capsys):
+    args = ["record", "--out", tmp_path / "o", "--object-id", "cup", "--contact-mm", 0, 0, 300]
+    assert run(*args, "replay", "--path", press) == 1
+    assert "contact_mm is (0.0, 0.0, 300.0): no RGB-D camera is named" in capsys.readouterr().err.replace("\n", " ")
+    assert not (tmp_path / "o").exists()
+
+
 def test_devices_says_what_is_absent(capsys):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
