@@ -2,7 +2,7 @@
 
 import dataclasses
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Self
 
 from sensors_io.errors import MALFORMED, UserError
@@ -49,6 +49,16 @@ class Offsets:
         """Delay to subtract from the timestamps of each sensor; 0 for the reference."""
         return {self.reference: 0.0} | {name: offset.late_s for name, offset in self.sensors.items()}
 
+    def require(self, names: Iterable[str], path: pathlib.Path | None) -> None:
+        """Refuse sensors whose delay was not measured, which would be taken as 0.
+
+        Raises:
+          OffsetsError: naming them and the file of the offsets.
+        """
+        unknown = [name for name in names if name not in self.late_s]
+        if unknown:
+            raise OffsetsError(f"{path} knows nothing of {', '.join(unknown)}; measure again with `sync --out`")
+
     def save(self, path: pathlib.Path) -> None:
         """Write them as JSON, whole or not at all."""
         write_json(path, dataclasses.asdict(self))
@@ -63,7 +73,7 @@ class Offsets:
         try:
             tree = read_json(path)
             sensors = {str(name): Offset(**offset) for name, offset in tree["sensors"].items()}
-            late_s = [float(offset.late_s) for offset in sensors.values()]
+            late_s = [offset.late_s for offset in sensors.values()]
             if not all(abs(late) <= LARGEST_S for late in late_s):
                 raise ValueError(f"late_s are {late_s}: must lie within ±{LARGEST_S} s")
             return cls(reference=str(tree["reference"]), sensors=sensors)

@@ -17,6 +17,7 @@ from sensors_io.force import ForceError, GravityModel, fit_gravity, gravity_dire
 from sensors_io.json_files import read_json, write_json
 
 _LEAST_READINGS = 8  # in a stretch: fewer tell no spread
+_UNIT = 1e-3  # by which the length of a direction may differ from 1
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -74,7 +75,7 @@ class PoseFinder:
         values = np.stack([value for _, value in recent])
         spread_n = float(values[:, :3].std(0).max())
         mean = values.mean(0)
-        if spread_n > c.still_n or self._known(mean[:3]):
+        if not spread_n <= c.still_n or self._known(mean[:3]):
             self._forget_half()
             return None
         recent.clear()
@@ -119,6 +120,8 @@ class ForceZero:
             for v in (model.bias_n, model.bias_nmm, model.first_moment_nmm, down):
                 if v.shape != (3,) or not np.isfinite(v).all():
                     raise ValueError("its vectors must have three finite numbers")
+            if not np.isfinite(model.weight_n) or not np.isclose(np.linalg.norm(down), 1, atol=_UNIT):
+                raise ValueError("weight_n must be finite, and down of length 1")
             return cls(model=model, down=down)
         except (OSError, *MALFORMED) as error:
             raise ForceError(f"{path} holds no gravity model ({error!r}); make one with `force-zero`") from error

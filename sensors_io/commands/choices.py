@@ -115,6 +115,9 @@ def readers(configs: Seq[AnyConfig], *, numbers: bool = False) -> Iterator[list[
     Args:
       configs: of the devices.
       numbers: that no pictures are expected, and thousands of samples are kept.
+
+    Raises:
+      DeviceNotFoundError: one is absent, or two have one name.
     """
     with contextlib.ExitStack() as stack:
         made = []
@@ -122,6 +125,11 @@ def readers(configs: Seq[AnyConfig], *, numbers: bool = False) -> Iterator[list[
             many = numbers or isinstance(config, NetFtConfig)
             keep = ReaderConfig(capacity=_FORCE_CAPACITY) if many else ReaderConfig()
             made.append(stack.enter_context(Reader(opened(config), config=keep)))
+        names = [reader.identity.sensor for reader in made]
+        if len(set(names)) != len(names):
+            raise DeviceNotFoundError(
+                f"devices are {names}: each name once; name them apart, such as --sensor gelsight_mini.left"
+            )
         yield made
 
 

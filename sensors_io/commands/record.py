@@ -16,7 +16,7 @@ import rich.table
 from sensors_io.commands.choices import Bench, readers, stop_on_interrupt
 from sensors_io.commands.console import ERR, OUT, live_display
 from sensors_io.commands.extraction import Extraction
-from sensors_io.devices.errors import StreamEndedError
+from sensors_io.devices.errors import DeviceNotFoundError, StreamEndedError
 from sensors_io.devices.reader import Reader
 from sensors_io.devices.rgbd import contact_region
 from sensors_io.devices.rgbd_camera import RgbdCameraConfig
@@ -98,12 +98,18 @@ class Record(Bench):
     def run(self) -> int:
         parts = self.parts()
         parts.require_tactile()
+        if self.contact_mm is not None and parts.view is None:
+            raise DeviceNotFoundError(
+                f"contact_mm is {self.contact_mm}: no RGB-D camera is named to see it; add + rgbd …, or leave it out"
+            )
         config = self.session()
         _warn_of_little_disk(self.out)
         with contextlib.ExitStack() as stack:
             stop = stack.enter_context(stop_on_interrupt())
             tactile = stack.enter_context(readers(parts.tactile))
             force = stack.enter_context(readers((parts.force,) if parts.force else ()))
+            if self.sync is not None:
+                Offsets.load(self.sync).require([device.identity.sensor for device in (*tactile, *force)], self.sync)
             view = None if parts.view is None else self.look(parts.view)
             board = _Board()
             show = stack.enter_context(board.shown())

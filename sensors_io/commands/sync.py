@@ -57,9 +57,6 @@ class Sync(Bench):
                         listener.look()
                     live.update(_board(listeners, end_s - time.monotonic()))
                     stop.wait(_LOOK_S)
-        names = [listener.name for listener in listeners]
-        if len(set(names)) != len(names):
-            raise OffsetsError(f"devices are {names}: each name once; name them apart, such as --sensor tac3d.left")
         first, *others = listeners
         signals = {listener.name: listener.signal() for listener in others}
         found = measure_offsets(first.signal(), signals, first.name, self.by)
@@ -74,9 +71,7 @@ class Sync(Bench):
     def _check(self, found: Offsets, stored: Offsets) -> int:
         """Report the delays that remain after stored offsets; exit status 1 if any is too large."""
         before = stored.late_s
-        unknown = [name for name in found.late_s if name not in before]
-        if unknown:
-            raise OffsetsError(f"{self.check} knows nothing of {', '.join(unknown)}; measure again with --out")
+        stored.require(found.late_s, self.check)
         zero_s = before[found.reference]
         left_s = {name: offset.late_s - (before[name] - zero_s) for name, offset in found.sensors.items()}
         table = Table("sensor", "remaining delay", f"against {found.reference}, at most {1e3 * self.most_s:g} ms")

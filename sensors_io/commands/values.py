@@ -14,7 +14,7 @@ MOST = 1e15
 
 
 def require_possible(value: Any, where: str = "") -> None:
-    """Refuse numbers that are no quantity, ports that there are not, and paths of pipes and devices, in all fields.
+    """Refuse numbers that are no quantity, times below 0, no ports, and paths of pipes and devices, in all fields.
 
     A pipe or a device is read without end, or not at all, and an output is renamed onto its path.
 
@@ -43,6 +43,8 @@ def require_possible(value: Any, where: str = "") -> None:
             raise ValueError(f"{where}: {error}") from error
     elif isinstance(value, float) and not abs(value) <= MOST:
         raise ValueError(f"{where} is {value}: must be a number within ±{MOST:g}; correct it")
+    elif isinstance(value, float) and value < 0 and (where == "seconds" or where.endswith("_s")):
+        raise ValueError(f"{where} is {value}: must be ≥ 0 seconds; correct it")
     elif isinstance(value, int) and where.endswith("port") and not 0 <= value <= PORTS:
         raise ValueError(f"{where} is {value}: must lie in 0 … {PORTS}; correct it")
 

@@ -56,6 +56,16 @@ class Sample:
     arrays: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
 
+def require_pitch(mm_per_px: float | None) -> None:
+    """Refuse what is no pitch of a picture of a gel, such as px per mm.
+
+    Raises:
+      ValueError: it is outside (0, 1).
+    """
+    if mm_per_px is not None and not 0 < mm_per_px < 1:
+        raise ValueError(f"mm_per_px is {mm_per_px}: must lie in (0, 1); measure it with `geometry`")
+
+
 class Device(Protocol):
     """Anything that gives samples."""
 

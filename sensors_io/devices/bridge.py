@@ -28,9 +28,10 @@ import cv2
 import numpy as np
 
 from sensors_io.devices import bridge_server
-from sensors_io.devices.base import Identity, Sample
+from sensors_io.devices.base import Identity, Sample, require_pitch
 from sensors_io.devices.errors import DeviceDataError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
 from sensors_io.errors import MALFORMED
+from sensors_io.schema import FRAME_ARRAYS
 
 _SERVER = pathlib.Path(bridge_server.__file__)
 _LARGEST_HEADER = 1 << 16  # bytes: a few names and shapes
@@ -44,6 +45,8 @@ _OURS = ("PYTHONPATH", "PYTHONHOME")  # would make the vendor's Python import wh
 
 _MOMENT_UNIT_NMM = {"resultant": 1.0, "resultant_n_cnm": 10.0}
 """Resultants by the name that an adapter gives them: force in N, moment in this unit."""
+
+_FIELDS = ("deformation_mm", "shear_mm", "depth_mm", "valid", "force_n", "moment_nmm")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -67,6 +70,9 @@ class BridgeConfig:
     rate_hz: float = 0.0
     wait_s: float = 60.0
     mm_per_px: float | None = None
+
+    def __post_init__(self) -> None:
+        require_pitch(self.mm_per_px)
 
     def open(self) -> "Bridge":
         """The device, not open yet."""
@@ -107,9 +113,14 @@ def to_schema(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray | None, dict
     """Picture in RGB, and the other arrays as the schema has them: float32, a 6-D resultant as force and moment.
 
     A resultant without a unit is taken as Fx Fy Fz in N, Mx My Mz in N mm: hold it against a known weight.
+
+    Raises:
+      DeviceDataError: an array of another name, which no record would keep, or of another shape.
     """
     rest = dict(arrays)
     picture = rest.pop("frame_bgr", None)
+    for name, array in rest.items():
+        _require_known(name, array)
     resultants = {name: rest.pop(name) for name in _MOMENT_UNIT_NMM if name in rest}
     fields = {name: _float32(a) for name, a in rest.items()}
     for name, resultant in resultants.items():
@@ -123,13 +134,29 @@ def to_schema(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray | None, dict
             fields["moment_nmm"] = six[3:6] * np.float32(_MOMENT_UNIT_NMM[name])
     if picture is None:
         return None, fields
-    if picture.dtype != np.uint8 or picture.ndim not in (2, 3) or picture.shape[2:] not in ((), (1,), (3,)):
+    flat = picture.ndim == 2 or (picture.ndim == 3 and picture.shape[2] in (1, 3))
+    if picture.dtype != np.uint8 or not picture.size or not flat:
         raise DeviceDataError(
-            f"bridge picture is {picture.dtype}{list(picture.shape)}: must be uint8 [H, W] or [H, W, 3]; correct it"
+            f"bridge picture frame_bgr is {picture.dtype}{list(picture.shape)}: must be uint8 [H, W] or [H, W, 3]; "
+            "correct the adapter"
         )
     picture = picture.reshape(picture.shape[:2]) if picture.shape[2:] == (1,) else picture
     code = cv2.COLOR_GRAY2RGB if picture.ndim == 2 else cv2.COLOR_BGR2RGB
     return cv2.cvtColor(picture, code), fields
+
+
+def _require_known(name: str, array: np.ndarray) -> None:
+    if name in _MOMENT_UNIT_NMM:
+        return
+    if name not in _FIELDS:
+        known = ", ".join(("frame_bgr", *_MOMENT_UNIT_NMM, *_FIELDS))
+        raise DeviceDataError(f"bridge array is named {name!r}: must be one of {known}; correct the adapter")
+    dims = FRAME_ARRAYS[name].dims[1:]
+    sizes = [size for size, dim in zip(array.shape, dims, strict=False) if dim in (str(size), "h", "w")]
+    if array.ndim != len(dims) or len(sizes) != len(dims) or not array.size:
+        raise DeviceDataError(
+            f"bridge array {name} is {list(array.shape)}: must be [{', '.join(dims)}]; correct the adapter"
+        )
 
 
 def _float32(array: np.ndarray) -> np.ndarray:

@@ -50,6 +50,12 @@ class RgbdCameraConfig:
     depth_unit_mm: float = 1.0
     max_apart_s: float = 0.017
 
+    def __post_init__(self) -> None:
+        for name in ("rate_hz", "depth_unit_mm"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} is {getattr(self, name)}: must be > 0; see the camera's manual")
+        _ = self.intrinsics, self._camera(None, None, self.colour_format)  # each refuses its own values
+
     @property
     def intrinsics(self) -> Intrinsics:
         """Of both pictures."""

@@ -16,7 +16,7 @@ from sensors_io.devices.errors import DeviceNotFoundError, StreamEndedError
 from sensors_io.errors import path_text
 from sensors_io.importers.pictures import PictureError, below, read_picture
 from sensors_io.records import RecordStore
-from sensors_io.schema import FRAME_ARRAYS, Sequence
+from sensors_io.schema import FRAME_ARRAYS, Flag, Sequence
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
@@ -96,7 +96,10 @@ class VideoFile:
         capture = self._open()
         rate = float(capture.get(cv2.CAP_PROP_FPS))
         capture.release()
-        _require_rate(rate)
+        if not 0 < rate <= NS_PER_S:
+            raise DeviceNotFoundError(
+                f"{self.path} states {rate:g} frames a second: must be > 0; write it anew with one"
+            )
         return rate
 
     def samples(self) -> Iterator[Recorded]:
@@ -172,9 +175,19 @@ class RecordedContact:
     def samples(self) -> Iterator[Recorded]:
         s = self._sequence
         known = {n: a for n in FRAME_ARRAYS if n not in ("frames", "host_time_ns") and (a := getattr(s, n)) is not None}
+        numbers = frame_numbers(s).tolist()
         for i, time in enumerate(s.host_time_ns - s.host_time_ns[0]):
             frame = None if s.frames is None else s.frames[i]
-            yield Recorded(time_ns=int(time), index=i, frame=frame, arrays={name: a[i] for name, a in known.items()})
+            arrays = {name: a[i] for name, a in known.items()}
+            yield Recorded(time_ns=int(time), index=numbers[i], frame=frame, arrays=arrays)
+
+
+def frame_numbers(sequence: Sequence) -> np.ndarray:
+    """Counter of the frames of a sequence, int64 [N]; it skips those lost before a frame flagged `TIME_GAP`."""
+    steps = np.diff(sequence.host_time_ns)
+    periods = np.rint(steps / max(float(np.median(steps)), 1.0)) if len(steps) else steps
+    lost = (sequence.flags[1:] & np.uint32(Flag.TIME_GAP)) > 0
+    return np.cumsum([0, *np.where(lost, np.maximum(periods, 1), 1)]).astype(np.int64)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

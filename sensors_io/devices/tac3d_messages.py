@@ -276,11 +276,25 @@ def load_recording(path: pathlib.Path) -> Tac3dArrays:
         raise DeviceDataError(str(error)) from error
     if not {"index", "sendTimestamp"} <= arrays.keys():
         raise DeviceDataError(f"{path} holds {sorted(arrays)}: index and sendTimestamp must be among them")
+    matrices = {name: a for name, a in arrays.items() if name.startswith("3D_")}
+    for name in ("index", "sendTimestamp", "recvTimestamp", *matrices):
+        _require_numbers(path, name, arrays.get(name, arrays["index"]))
     index, times = arrays["index"].ravel(), arrays["sendTimestamp"].ravel().astype(np.float64)
     received = arrays["recvTimestamp"].ravel().astype(np.float64) if "recvTimestamp" in arrays else None
-    matrices = {name: a for name, a in arrays.items() if name.startswith("3D_")}
     if any(
         len(a) != len(index) for a in (times, received if received is not None else times, *matrices.values())
     ) or not len(index):
         raise DeviceDataError(f"{path}: its arrays must be of one length > 0; copy the recording again")
     return Tac3dArrays(index=index, send_time_s=times, receive_time_s=received, matrices=matrices)
+
+
+def _require_numbers(path: pathlib.Path, name: str, array: np.ndarray) -> None:
+    """Refuse a row of times or counts, or fields, that are no numbers, and times or counts beyond what 64 bits hold."""
+    top = _LATEST_S if name.endswith("Timestamp") else 2.0**63 if name == "index" else None
+    numbers = array.ndim > 0 and array.dtype.kind in "fiu"
+    if not numbers or (top is not None and not np.all(np.abs(array.astype(np.float64)) < top)):
+        raise DeviceDataError(
+            f"{path}: {name} is {array.dtype}{list(array.shape)}: must hold a number for each message"
+            + ("" if top is None else f", finite and below {top:g}")
+            + "; copy the recording again"
+        )

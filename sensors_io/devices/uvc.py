@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from sensors_io.clock import NS_PER_S
-from sensors_io.devices.base import Identity, Sample
+from sensors_io.devices.base import Identity, Sample, require_pitch
 from sensors_io.devices.cameras import CameraInfo, find_cameras
 from sensors_io.devices.errors import (
     DeviceLostError,
@@ -96,8 +96,10 @@ class UvcConfig:
             )
         if bool(self.frame_width) != bool(self.frame_height):
             raise ValueError("frame_width and frame_height must both be given, or neither; give the other one")
-        if self.mm_per_px is not None and not self.mm_per_px > 0:
-            raise ValueError(f"mm_per_px is {self.mm_per_px}: must be > 0; measure it with `geometry`")
+        for name in ("width", "height", "frame_width", "frame_height", "rate_hz"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} is {getattr(self, name)}: must be ≥ 0; 0 keeps the camera's own")
+        require_pitch(self.mm_per_px)
 
     def open(self) -> "Uvc":
         """The device, not open yet."""

@@ -110,6 +110,8 @@ def _load(path: pathlib.Path) -> dict[str, np.ndarray]:
     missing = [name for name in _SHAPES if name not in arrays]
     if missing:
         raise RecordingError(f"lacks {', '.join(missing)}")
+    if arrays["index"].ndim != 1:
+        raise RecordingError(f"index has shape {arrays['index'].shape}: must be (N,)")
     count = len(arrays["index"])
     for name, array in arrays.items():
         shape = _SHAPES.get(name, ())

@@ -240,10 +240,10 @@ class _Force:
 
 
 def _gaps(time_ns: np.ndarray, index: Seq[int | None], period_s: float | None) -> np.ndarray:
-    """Frames before which at least one is missing, by the counter or else by the period."""
+    """Frames before which one is missing or the counter began anew, by the counter or else by the period."""
     counter = [i for i in index if i is not None]
     if len(counter) == len(index):
-        return np.diff(np.array(counter, np.int64), prepend=counter[0] - 1) > 1
+        return np.diff(np.array(counter, np.int64), prepend=counter[0] - 1) != 1
     if period_s is None:
         return np.zeros(len(time_ns), bool)
     return np.diff(time_ns, prepend=time_ns[0]) > _GAP_PERIODS * period_s * NS_PER_S

@@ -104,12 +104,21 @@ class Coach:
         self._phase = Phase.APPROACH
         self._since_ns = 0
         self._tapped = 0
+        self._normal = 0.0
         self._done = self._complete = False
 
+    @property
+    def begun(self) -> bool:
+        """True from the first touch on."""
+        return self._phase != Phase.APPROACH or self._tapped > 0 or self._done
+
     def step(self, time_ns: int, force_n: np.ndarray) -> Advice:
-        """Take one force [3] on the gel into account."""
-        normal = -float(force_n[2])
-        if not self._armed:
+        """Take one force [3] on the gel into account; one that is not finite is none, and changes nothing."""
+        finite = bool(np.isfinite(force_n).all())
+        normal = self._normal = -float(force_n[2]) if finite else self._normal
+        if not finite:
+            pass
+        elif not self._armed:
             self._arm(time_ns, normal)
         elif not self._done:
             self._advance(time_ns, normal)
@@ -194,6 +203,7 @@ class FreeCoach:
     def __init__(self, seconds: float):
         self._seconds = seconds
         self._start_ns: int | None = None
+        self.begun = True
 
     def step(self, time_ns: int, force_n: np.ndarray) -> Advice:
         """Take one moment into account; `force_n` is shown only."""
@@ -205,6 +215,6 @@ class FreeCoach:
             recording=left_s > 0,
             done=left_s <= 0,
             complete=True,
-            normal_n=-float(force_n[2]),
+            normal_n=-float(np.nan_to_num(force_n[2])),
             target_n=0.0,
         )

@@ -73,6 +73,10 @@ class JournalWriter:
             os.fdatasync(self._file)
             self._synced_s = now_s
 
+    def restart(self) -> None:
+        """Forget all entries."""
+        os.ftruncate(self._file, 0)
+
     def close(self) -> None:
         """Bring everything to the disk."""
         os.fsync(self._file)

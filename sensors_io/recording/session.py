@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from sensors_io.clock import NS_PER_S
 from sensors_io.devices.base import Sample
 from sensors_io.devices.errors import DeviceError, StreamEndedError
 from sensors_io.devices.intake import Counts
@@ -27,6 +28,7 @@ from sensors_io.records import RecordsMeta, RecordWriter
 from sensors_io.schema import ContactKey, Phase, SchemaError
 
 _JOURNALS = ".journals"
+_UNTOUCHED_S = 20.0  # kept of the time before the first touch; a contact is stored from memory, a pause may be long
 _IDLE_S = 0.002  # between looks at the devices; a tenth of the fastest camera's period
 
 
@@ -167,9 +169,10 @@ class _Session:
         path = self._book.path(key)
         complete, failure = False, None
         with JournalWriter(path) as journal:
-            journal.append("start", self._start(key, stage), **self._backgrounds())
+            begin = lambda: journal.append("start", self._start(key, stage), **self._backgrounds())
+            begin()
             try:
-                complete = self._run(stage, coach, journal)
+                complete = self._run(stage, coach, journal, begin)
             except DeviceError as error:
                 failure = error  # raised below, when what was recorded is in the records
             journal.append("end", {"complete": complete, "counts": self._counts()}, **self._backgrounds())
@@ -179,10 +182,13 @@ class _Session:
         if failure is not None:
             raise failure
 
-    def _run(self, stage: ContactStage, coach: Coach | FreeCoach, journal: JournalWriter) -> bool:
+    def _run(
+        self, stage: ContactStage, coach: Coach | FreeCoach, journal: JournalWriter, begin: Callable[[], None]
+    ) -> bool:
         """Read until the coach says done; whether the contact is complete."""
         phase: Phase | None = None
         advice: Advice | None = None
+        since_ns: int | None = None
         while not self._stop():
             looked = [stream.look() for stream in self._streams]
             times, forces = self._forces(looked, journal)
@@ -192,6 +198,12 @@ class _Session:
                     phase = advice.phase
                     journal.append("phase", {"time_ns": int(at), "phase": int(phase)})
             self._take(looked, advice, journal)
+            if len(times) and not coach.begun:
+                since_ns = int(times[0]) if since_ns is None else since_ns
+                if times[-1] - since_ns > _UNTOUCHED_S * NS_PER_S:
+                    journal.restart()
+                    begin()
+                    phase = since_ns = None
             if advice is not None:
                 self._show(self._status(stage, advice))
                 if advice.done:
@@ -236,7 +248,7 @@ class _Session:
     def _measured(self, samples: list[Sample], journal: JournalWriter) -> tuple[np.ndarray, np.ndarray]:
         """Readings of the force sensor, compensated, in the gel's frame; journaled."""
         times = np.array([s.host_time_ns for s in samples], np.int64)
-        force, moment = _stacked(samples, "force_n"), _stacked(samples, "moment_nmm")
+        force, moment = _stacked(samples, "force_n"), _stacked(samples, "moment_nmm", lacking=0.0)
         beyond = np.array([bool(s.arrays.get("out_of_range", False)) for s in samples], bool)
         if self._config.gravity is not None:
             force, moment = self._config.gravity.contact(force, moment, self._config.down)
@@ -273,6 +285,6 @@ class _Session:
         )
 
 
-def _stacked(samples: list[Sample], name: str) -> np.ndarray:
-    """A vector of every sample, float64 [n, 3]; 0 where one lacks it."""
-    return np.array([s.arrays.get(name, np.zeros(3)) for s in samples], np.float64).reshape(-1, 3)
+def _stacked(samples: list[Sample], name: str, lacking: float = np.nan) -> np.ndarray:
+    """A vector of every sample, float64 [n, 3]; `lacking` where one has none."""
+    return np.array([s.arrays.get(name, np.full(3, lacking)) for s in samples], np.float64).reshape(-1, 3)

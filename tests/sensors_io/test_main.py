@@ -134,6 +134,19 @@ NO_DIRECTORY = [[*name.split(), "nowhere"] for name in (*LAYOUTS.split(), "vtv15
         (2, ["extract", "/dev/zero", *EXTRACT[2:]], "ValueError: inputs is /dev/zero: must be a file"),
         (2, ["devices", "--tac3d-port", "-1"], "ValueError: tac3d_port is -1: must lie in 0 … 65535"),
         (2, ["devices", "--wait-s", "1e300"], "ValueError: wait_s is 1e+300: must be"),
+        *(
+            (2, [*command.split(), "-1", *device], f"ValueError: {name} is -1.0: must be ≥ 0")
+            for command, name, device in (
+                ("devices --wait-s", "wait_s", []),
+                ("view tac3d --wait-s", "wait_s", []),
+                ("sync netft + tac3d --wait-s", "wait_s", []),
+                ("view tac3d + bridge --wait-s", "wait_s", []),
+                ("force-zero --out o --wait-s", "wait_s", ["netft"]),
+                ("zero --seconds", "seconds", ["netft"]),
+                ("sync --most-s", "most_s", ["netft"]),
+                ("record --out o --object-id a --free-s", "free_s", ["tac3d"]),
+            )
+        ),
         (2, ["view", "--port", "99999", *REPLAY], "ValueError: port is 99999: must lie in 0 … 65535"),
         (2, ["view", *REPLAY, "+", "tac3d", "--port", "70000"], "ValueError: port is 70000: must lie in 0 … 65535"),
         (2, ["list", "/dev/zero"], "ValueError: records is /dev/zero: must be a file or a folder, not a pipe"),

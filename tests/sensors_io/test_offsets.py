@@ -30,6 +30,7 @@ def test_offsets_come_back(tmp_path):
         {"reference": "netft"},
         {"reference": "a", "sensors": {"b": {"late_s": 1}}},
         {"reference": "a", "sensors": {"b": {"late_s": 31, "spread_s": 0, "events": 1, "by": "taps"}}},
+        {"reference": "a", "sensors": {"b": {"late_s": "0.1", "spread_s": 0, "events": 1, "by": "taps"}}},
         {"reference": "a", "sensors": {"b": {"late_s": float("nan"), "spread_s": 0, "events": 1, "by": "taps"}}},
     ],
 )

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sensors_io.force import ForceError
+from sensors_io.json_files import read_json
 from sensors_io.poses import ForceZero, PoseConfig, PoseFinder, fit_poses
 from tests.sensors_io.checks import refused
 from tests.sensors_io.test_force import BIAS, BIAS_M, CENTRE, WEIGHT
@@ -48,6 +49,14 @@ def test_every_pose_is_found_once_and_tells_bias_and_weight():
     assert zero.model.rms_n < 0.01
 
 
+def test_a_reading_that_is_not_finite_is_in_no_pose():
+    times, force, moment, _ = turned()
+    force[100] = np.nan
+    poses = found_in(times, force, moment)
+    assert len(poses) == 8
+    assert np.isfinite([pose.force_n for pose in poses]).all()
+
+
 def test_a_zero_comes_back_from_its_file(tmp_path):
     zero = fit_poses(found_in(*turned()[:3]))
     path = tmp_path / "g.json"
@@ -60,11 +69,20 @@ def test_a_zero_comes_back_from_its_file(tmp_path):
 
 @pytest.mark.parametrize(
     "change",
-    [{"down": [1, 2]}, {"bias_n": 3}, {"weight": 1}, {"bias_n": [0, 0, float("nan")]}, {"weight_n": "x"}, None],
+    [
+        {"down": [1, 2]},
+        {"bias_n": 3},
+        {"weight": 1},
+        {"bias_n": [0, 0, float("nan")]},
+        {"weight_n": "x"},
+        {"weight_n": 1e999},
+        {"down": [0, 0, -2]},
+        None,
+    ],
 )
 def test_a_file_without_a_zero_is_named(tmp_path, change):
     path = tmp_path / "g.json"
     fit_poses(found_in(*turned()[:3])).save(path)
-    tree = [] if change is None else json.loads(path.read_text()) | change
+    tree = [] if change is None else read_json(path) | change  # without a checksum, as one that somebody wrote
     path.write_text(json.dumps(tree))
     refused(ForceError, "make one with `force-zero`", ForceZero.load, path)

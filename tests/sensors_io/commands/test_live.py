@@ -166,6 +166,38 @@ def test_view_extracts_fields_of_a_camera(tmp_path, capsys):
     assert "calibration is for 'x', the pictures are of 'gelsight_mini'" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("command", ["view --port 0 --seconds 0.1", "sync --seconds 0.1"])
+def test_devices_of_one_name_are_refused_at_once(tmp_path, command, press, capsys):
+    """Else the page shows the panels of one of them."""
+    replay = ["replay", "--path", press]
+    assert run(*command.split(), *replay, "+", *replay) == 1
+    assert "devices are ['tac3d', 'tac3d']: each name once; name them apart" in capsys.readouterr().err
+
+
+def test_a_recording_of_a_sensor_whose_delay_nobody_measured_is_refused(tmp_path, press, capsys):
+    Offsets(reference="netft", sensors={"gelsight_mini": Offset(late_s=0.1, spread_s=0, events=5, by="taps")}).save(
+        tmp_path / "s.json"
+    )
+    args = ["record", "--out", tmp_path / "o", "--object-id", "cup", "--free-s", 0.2, "--sync", tmp_path / "s.json"]
+    assert run(*args, "replay", "--path", press) == 1
+    assert "s.json knows nothing of tac3d" in capsys.readouterr().err.replace("\n", " ")
+
+
+@pytest.mark.parametrize("wrong", ["--fx 0", "--colour-format XX", "--rate-hz 0", "--depth-unit-mm 0", "--width -1"])
+def test_a_camera_of_the_object_refuses_numbers_while_the_command_is_read(wrong, capsys):
+    with pytest.raises(SystemExit) as stop:
+        run("view", "rgbd", "--fx", 600, "--fy", 600, "--cx", 320, "--cy", 240, *wrong.split())
+    assert stop.value.code == 2
+    assert f"{wrong.split()[0][2:].replace('-', '_').replace('colour', 'pixel')} is" in capsys.readouterr().err
+
+
+def test_where_a_contact_shows_needs_a_camera_that_shows_it(tmp_path, press, capsys):
+    args = ["record", "--out", tmp_path / "o", "--object-id", "cup", "--contact-mm", 0, 0, 300]
+    assert run(*args, "replay", "--path", press) == 1
+    assert "contact_mm is (0.0, 0.0, 300.0): no RGB-D camera is named" in capsys.readouterr().err.replace("\n", " ")
+    assert not (tmp_path / "o").exists()
+
+
 def test_devices_says_what_is_absent(capsys):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
@@ -189,7 +221,7 @@ def test_two_sensors_are_recorded_into_one_contact(tmp_path, press, capsys):
     """Each at its own rate, one offset taken off, with a page beside the recording; once more, nothing is missing."""
     out, sync = tmp_path / "records", tmp_path / "s.json"
     late = Offset(late_s=0.1, spread_s=0.001, events=5, by="taps")
-    Offsets(reference="netft", sensors={"gelsight_mini": late}).save(sync)
+    Offsets(reference="tac3d", sensors={"gelsight_mini": late}).save(sync)
     camera = ["replay", "--path", pictures(tmp_path / "film", range(40, 80)), "--rate-hz", 50]
     bench = [*camera, "+", "replay", "--path", press]
     args = ["record", "--out", out, "--object-id", "cup", "--free-s", 0.4, "--sync", sync, "--port", 0, *bench]

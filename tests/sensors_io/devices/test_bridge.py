@@ -48,6 +48,23 @@ def test_damaged_frames_are_refused():
         refused(DeviceDataError, "cannot be read", bridge.unpack, far, b"")
 
 
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [
+        ("frame", (4, 6, 3)),
+        ("frame_bgr", (0, 6, 3)),
+        ("temperature", ()),
+        ("force_n", (6,)),
+        ("depth_mm", (4, 6, 1)),
+        ("depth_mm", (0, 6)),
+        ("shear_mm", (4, 6, 3)),
+        ("kind", (2,)),
+    ],
+)
+def test_arrays_that_no_record_holds_are_refused(name, shape):
+    refused(DeviceDataError, f"bridge .*{name}.*correct", bridge.to_schema, {name: np.zeros(shape, np.uint8)})
+
+
 XENSESDK = '''
 """What xensesdk offers, without NumPy: arrays that know their type, shape and bytes."""
 import enum

@@ -1,5 +1,8 @@
 """Folders, videos, records and scenes replayed as devices."""
 
+import dataclasses
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import pytest
@@ -9,8 +12,9 @@ from sensors_io.devices.errors import DeviceNotFoundError, StreamEndedError
 from sensors_io.devices.replay import Disconnect, Faults, ReplayConfig
 from sensors_io.devices.scene import SceneDeviceConfig
 from sensors_io.devices.scene_source import SceneSource
-from sensors_io.devices.sources import RecordedContact
+from sensors_io.devices.sources import RecordedContact, VideoFile, frame_numbers
 from sensors_io.scenes.config import SceneConfig
+from sensors_io.schema import Flag
 from tests.sensors_io import fakes as records
 from tests.sensors_io.checks import refused
 from tests.sensors_io.importers.films import cut, film, picture
@@ -47,6 +51,24 @@ def test_a_contact_of_records_with_all_of_its_arrays(tmp_path):
     np.testing.assert_allclose(samples[5].arrays["force_n"], made.force_n[5], atol=1e-3)
     with pytest.raises(DeviceNotFoundError, match="not 'dmtac'"):
         ReplayConfig(path=tmp_path, sensor="dmtac").open(JumpingClock()).__enter__().read(1.0)
+
+
+def test_gaps_of_records_stay_gaps(tmp_path):
+    """Of the frames that are flagged, two were lost before 5, and none before 9."""
+    made = records.sequence(0, "xense")
+    flags = np.zeros(len(made), np.uint32)
+    flags[[5, 9]] = Flag.TIME_GAP
+    time_ns = np.arange(len(made)) * 40_000_000
+    time_ns[5:] += 80_000_000
+    counts = frame_numbers(dataclasses.replace(made, flags=flags, host_time_ns=time_ns))
+    assert counts.tolist() == [0, 1, 2, 3, 4, 7, 8, 9, 10, 11, 12, 13]
+    assert frame_numbers(dataclasses.replace(made, flags=flags, host_time_ns=0 * time_ns))[-1] == len(made) - 1
+
+
+def test_a_video_without_a_rate_is_named(tmp_path, monkeypatch):
+    path = film(tmp_path / "a.avi", 3)
+    monkeypatch.setattr(VideoFile, "_open", lambda self: SimpleNamespace(get=lambda what: 0.0, release=lambda: None))
+    refused(DeviceNotFoundError, "a.avi states 0 frames a second", lambda: VideoFile(path=path).identity)
 
 
 @pytest.mark.long

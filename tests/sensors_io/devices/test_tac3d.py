@@ -195,3 +195,21 @@ def test_an_incomplete_recording_is_refused(tmp_path):
     refused(DeviceDataError, "sendTimestamp must be among them", tac3d_messages.load_recording, tmp_path / "a.npz")
     np.savez(tmp_path / "b.npz", index=np.arange(3), sendTimestamp=np.arange(2.0))
     refused(DeviceDataError, "one length", tac3d_messages.load_recording, tmp_path / "b.npz")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"sendTimestamp": np.array([0, np.nan, 1])},
+        {"sendTimestamp": np.array([0, 1e12, 2e12])},
+        {"sendTimestamp": np.array(["a", "b", "c"])},
+        {"index": np.array([0, np.nan, 1])},
+        {"index": np.array(["a", "b", "c"])},
+        {"index": np.array([1, 2, 2**63], np.uint64)},
+        {"3D_ResultantForce": np.full((3, 1, 3), "a")},
+        {"3D_ResultantForce": np.array(1.0)},
+    ],
+)
+def test_a_recording_of_what_is_no_number_is_refused(tmp_path, changes):
+    np.savez(tmp_path / "a.npz", **{"index": np.arange(3), "sendTimestamp": np.arange(3.0)} | changes)
+    refused(DeviceDataError, next(iter(changes)), tac3d_messages.load_recording, tmp_path / "a.npz")

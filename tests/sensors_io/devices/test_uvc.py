@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from sensors_io.devices.bridge import BridgeConfig
 from sensors_io.devices.cameras import CameraInfo, find_cameras
 from sensors_io.devices.errors import DeviceLostError, DeviceNotFoundError, DeviceTimeoutError, SettingRefusedWarning
 from sensors_io.devices.reader import Reader
@@ -169,11 +170,19 @@ def test_the_cameras_of_one_device_are_told_apart_by_their_interfaces(tmp_path):
     refused(DeviceNotFoundError, "interface 7: no camera", lambda: UvcConfig(product="D435", interface=7).choose(found))
 
 
+@pytest.mark.parametrize("name", ["width", "height", "frame_width", "frame_height", "rate_hz"])
+def test_negative_sizes_are_refused(name):
+    sizes = {"frame_width": 8, "frame_height": 8} | {name: -1}
+    refused(ValueError, f"{name} is -1: must be ≥ 0", UvcConfig, **sizes)
+
+
 def test_configs_are_checked():
     refused(ValueError, "border_share is 0.5", UvcConfig, border_share=0.5)
     refused(ValueError, "must have four letters", UvcConfig, pixel_format="MJPEG")
     refused(ValueError, "must both be given", UvcConfig, frame_width=4)
-    refused(ValueError, "mm_per_px is 0.0", UvcConfig, mm_per_px=0.0)
+    for mm_per_px in (0.0, -0.06, 15.8):  # the last in px per mm
+        for config in (UvcConfig, BridgeConfig):
+            refused(ValueError, rf"mm_per_px is {mm_per_px}: must lie in \(0, 1\)", config, mm_per_px=mm_per_px)
 
 
 def test_opencv_has_the_wait_and_takes_what_it_is_given(tmp_path):

@@ -17,7 +17,7 @@ ALL_TRAIN = Shares(val_share=0, test_share=0)
 
 def recording(*, index=(7, 8, 11), **changes):
     """A press of 0.8 mm and 5 N at rest point x = 3, y = −4 mm that drags it 0.2 mm to +x; points as the vendor's."""
-    n = len(index)
+    n = np.size(index)
     y, x = np.meshgrid(np.linspace(10, -10, SIDE), np.linspace(10, -10, SIDE), indexing="ij")
     rest = np.stack([x, y, np.full_like(x, 9.0)], -1).reshape(-1, 3)
     pressed = np.argmin(np.hypot(rest[:, 0] - 3, rest[:, 1] + 4))
@@ -82,6 +82,7 @@ def test_gaps_of_the_counter_are_flagged_and_counted(tmp_path):
         ({"recvTimestamp": np.arange(2.0)}, r"recvTimestamp has shape \(2,\): must be \(3,\)"),
         ({"3D_ResultantForce": np.full((3, 1, 3), np.inf)}, "no frame of finite values"),
         ({"3D_ResultantMoment": np.full((3, 1, 3), "7")}, "3D_ResultantMoment holds <U1: must hold numbers"),
+        ({"index": 7}, r"index has shape \(\): must be \(N,\)"),
         ({"sendTimestamp": 1e12 + np.arange(3)}, "times in ns: reach 1e\\+21, which 64 bits cannot hold"),
     ],
 )

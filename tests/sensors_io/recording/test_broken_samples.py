@@ -63,6 +63,19 @@ def test_values_that_no_sensor_measures_are_flagged_and_counted_and_the_rest_is_
         assert made.valid[[i for i in range(len(made)) if i not in rows]].all()
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        with_arrays(force_n=np.full(3, np.nan, np.float32)),
+        lambda sample: dataclasses.replace(sample, arrays={"depth_mm": sample.arrays["depth_mm"]}),
+    ],
+)
+def test_a_force_that_is_missing_for_a_moment_lets_nothing_go(tmp_path, change):
+    hand = Hand()
+    report = record_session(tmp_path, SHORT, [Camera(hand), Odd(hand, change)], None, show=hand.show)
+    assert (report.contacts, report.incomplete) == (2, 0)
+
+
 def test_samples_of_another_shape_are_left_out_and_counted(tmp_path):
     made = recorded(tmp_path, with_arrays(depth_mm=np.zeros((4, 4), np.float32)))
     assert made.camera["recording"]["left_out"] == 3

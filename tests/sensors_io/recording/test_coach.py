@@ -36,6 +36,18 @@ def test_a_tap_takes_three():
     assert [a.done for a in advice].index(True) == len(normals) - 1
 
 
+@pytest.mark.parametrize("at", [1, 3, 6, 8])
+def test_a_force_that_is_not_finite_changes_nothing(at):
+    """Before the contact is armed, before the first touch, at the force and while the hand lets go."""
+    normals = [0, 0, 0, 0, 1, 2, 2, 2, 2, 2, 1, 0]
+    advice = led(ContactStage(motion="tap", force_n=2), [*normals[:at], np.nan, *normals[at:]])
+    assert [a.phase for a in advice[:at] + advice[at + 1 :]] == [
+        a.phase for a in led(ContactStage(motion="tap", force_n=2), normals)
+    ]
+    assert advice[at].normal_n == advice[at - 1].normal_n
+    assert not any(a.done for a in advice)
+
+
 def test_nothing_begins_while_something_touches():
     assert not any(a.recording for a in led(ContactStage(motion="press", force_n=20), [5] * 20))
 

@@ -211,11 +211,33 @@ def test_a_device_that_fails_for_good_leaves_its_contact_in_the_records(tmp_path
     assert [(k.motion, k.trial) for k in store.contacts] == [("press", 0), ("press", 1), ("slide_x", 0)]
 
 
-def test_a_gap_of_the_camera_is_flagged(tmp_path):
+def test_a_pause_before_the_first_touch_is_not_recorded(tmp_path):
+    """Of a minute without a touch the last seconds are kept: all of it would not fit into memory when it is stored."""
+
+    class Pausing(Hand):
+        def move(self):
+            super().move()
+            self.force_n *= self.time_ns >= 61 * 10**9
+
+    hand = Pausing()
+    config = dataclasses.replace(SHORT, stages=SHORT.stages[:1])
+    report = session(tmp_path, hand, config)
+    made = RecordStore(tmp_path).contact(0)["gelsight_mini"]
+    assert (report.contacts, report.incomplete) == (1, 0)
+    assert 0 < (made.host_time_ns[-1] - made.host_time_ns[0]) / 1e9 < 25
+    assert np.all(np.diff(made.frames[:, 0, 0, 0].astype(int)) % 256 == 1)
+    assert not np.any(made.flags)
+    assert sorted(set(made.phase.tolist())) == [0, 1]
+
+
+@pytest.mark.parametrize("then", [41, 0])
+def test_a_gap_of_the_camera_is_flagged(tmp_path, then):
+    """Also that of one that was lost, and counts from the beginning again."""
+
     class Gappy(Camera):
         def drain(self):
             if self.count == 40:
-                self.count += 1
+                self.count = then
             return super().drain()
 
     hand = Hand()
