@@ -4,6 +4,8 @@ import multiprocessing
 import os
 import sys
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # see `experiments.core.numerics`; read when NumPy is imported
+
 from sensors_io.errors import require_words
 from sensors_io.signals import end_as_interrupted, leave_interrupted, say
 

@@ -13,6 +13,7 @@ from typing import IO
 import numpy as np
 
 from sensors_io.errors import MALFORMED, UserError, of_system
+from sensors_io.json_files import require_regular
 
 _BROKEN = (
     *MALFORMED, OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error, lzma.LZMAError, tokenize.TokenError,
@@ -37,6 +38,7 @@ def load_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     """
     path = pathlib.Path(path)
     try:
+        require_regular(path)
         if path.suffix == ".npy":
             with path.open("rb") as file:
                 return {path.stem: _array(file, path.stat().st_size)}

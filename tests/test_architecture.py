@@ -20,7 +20,7 @@ MAX_FILE, MAX_FUNCTION, MAX_ENTRIES = 400, 60, 15
 
 LAYERS = {
     "touchr1_jax": "types|validation|masked|skipping|text|models|rewards|rl|training|distributed|bench|asking",
-    "sensors_io": "errors signals|schema|arrays clock json_files units|sync taps force offsets|poses|deltas|quality|"
+    "sensors_io": "errors json_files signals|schema|arrays clock units|sync taps force offsets|poses|deltas|quality|"
     "measures|layer|codec|augment|remote tables selection locks|shards|index|contents|records|parts cards|"
     "pipeline importers scenes exporters|fields touches|calibration|devices|recording viewer|generate live overview|"
     "commands|__main__",

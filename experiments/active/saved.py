@@ -8,7 +8,6 @@ In training, beliefs are averaged over networks and probes; a saved policy uses 
 
 import dataclasses
 import hashlib
-import json
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -33,12 +32,13 @@ from experiments.active.policies import answerer, explore
 from experiments.active.world import TouchWorld, restored, stored
 from experiments.core.artifacts import DamagedFileError, jsonable, read_json, write_sealed
 from experiments.study.policies import POLICIES
+from sensors_io.json_files import require_regular
 from touchr1_jax.models.active_policy import ActivePolicy, build_active_policy
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.qwen.config import CONFIG_FILE
 from touchr1_jax.models.qwen.safetensors import read_header, read_tensor, write_file
 from touchr1_jax.models.qwen.weights import SINGLE
-from touchr1_jax.models.saved_policy import PolicyError
+from touchr1_jax.models.saved_policy import PolicyError, format_of
 from touchr1_jax.models.stacked import restacked, unstacked
 from touchr1_jax.rl.environment import TouchBank, TouchChoice
 from touchr1_jax.text.language import EXPLORED_ATTRIBUTES
@@ -167,11 +167,7 @@ def save_explorer(folder: Path, explorer: Explorer) -> None:
 
 def is_explorer(folder: Path) -> bool:
     """True for a folder that `save_explorer` wrote."""
-    try:
-        found = json.loads((folder / CONFIG_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    return isinstance(found, dict) and found.get("model_type") == FORMAT
+    return format_of(folder) == FORMAT
 
 
 def read_explorer(folder: Path) -> Explorer:
@@ -180,6 +176,7 @@ def read_explorer(folder: Path) -> Explorer:
         found = read_json(folder / CONFIG_FILE)
         if found["version"] != VERSION:
             raise PolicyError(f"policy is {folder}: version is {found['version']}: must be {VERSION}; train it anew")
+        require_regular(folder / SINGLE)
         if hashlib.sha256((folder / SINGLE).read_bytes()).hexdigest() != found["sha256"]:
             raise PolicyError(f"policy is {folder}: {SINGLE} was changed after it was written; copy the folder again")
         contacts = ContactsConfig(**_tuples(found["contacts"]))

@@ -125,6 +125,13 @@ def fitting(path: Path | str) -> Iterator[None]:
         ) from error
 
 
+def read_times(path: Path) -> dict[str, float]:
+    """Seconds by stage in the `timing.json` of a run, none before the first one; `DamagedFileError` if damaged."""
+    found = read_json(path) if path.exists() else {}
+    with fitting(path):
+        return {name: float(seconds) for name, seconds in found.items()}
+
+
 def point_link(link: Path, target: str) -> None:
     """Make `link` a symbolic link to `target`, replacing an older link, and nothing else, atomically."""
     if link.exists() and not link.is_symlink():

@@ -18,7 +18,9 @@ from rich.console import Console
 from experiments.core.artifacts import (
     DamagedFileError,
     UnwrittenError,
+    fitting,
     read_json,
+    read_times,
     write_arrays,
     write_sealed,
 )
@@ -94,6 +96,8 @@ class Context:
         """
         _checked(stage)
         if self._log is not None:
+            if not self._log.has_begun(stage):
+                self.rewind(stage, step)
             self._log.append(stage, step, scalars)
 
     def sampled(self, stage: str, step: int, sample: TrainingSample) -> None:
@@ -106,7 +110,7 @@ class Context:
         """Drop the logged lines of a stage at or past a step; needed only where the first new line may come later."""
         _checked(stage)
         if self._log is not None:
-            self._stage_file(f"{_LOGGED}/{stage}").unlink(missing_ok=True)
+            write_sealed(self._stage_file(f"{_LOGGED}/{stage}"), {"lines": summary([])})  # the run has this stage
             self._log.rewind(stage, step)
 
     def ended(self, stage: str) -> None:
@@ -117,15 +121,24 @@ class Context:
             )
 
     def require_log(self) -> None:
-        """`DamagedFileError` unless the log has the lines of all stages that have ended; no other look may be taken."""
+        """`DamagedFileError` unless the log has all lines of stages that have ended, and none of another run's stages.
+
+        No other look may be taken.
+        """
         folder = self.directory / "stages" / _LOGGED
         if self._log is None:
             return
-        lines = self._log.by_stage()
+        lines, timed = self._log.by_stage(), self.timing()
+        for stage in lines:  # earlier versions kept only the times of a stage that had not ended
+            if not (folder / f"{stage}.json").exists() and stage not in timed:
+                raise damaged_log(self.directory / "metrics.jsonl", f"this run has begun no stage {stage!r}")
         for path in sorted(folder.rglob("*.json")):
-            stage, kept = path.relative_to(folder).with_suffix("").as_posix(), read_json(path)["lines"]
-            if summary(lines.get(stage, [])[: kept[0]]) != kept:
-                how = f"of the {kept[0]} lines of stage {stage} some are missing or changed"
+            stage, kept = path.relative_to(folder).with_suffix("").as_posix(), read_json(path)
+            with fitting(path):
+                number, _ = kept["lines"]
+                same = summary(lines.get(stage, [])[:number]) == kept["lines"]
+            if not same:
+                how = f"of the {number} lines of stage {stage} some are missing or changed"
                 raise damaged_log(self.directory / "metrics.jsonl", how)
 
     def sort_log(self) -> None:
@@ -283,7 +296,7 @@ class Context:
 
     def timing(self) -> dict[str, float]:
         """Wall seconds of every timed stage so far."""
-        return read_json(self._timing_file) if self._timing_file.exists() else {}
+        return read_times(self._timing_file)
 
     @property
     def elapsed_s(self) -> float:

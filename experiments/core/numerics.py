@@ -1,6 +1,7 @@
-"""Settings that the bits of a result depend on besides configuration and code: JAX, XLA, device, processor.
+"""Settings that the bits of a result depend on besides configuration and code: JAX, XLA, NumPy, device, processor.
 
-Cores, threads and thread pools change no bit.  The number of devices does; the cache of policies counts the mesh.
+Cores, threads and thread pools change no bit: `experiments.__main__` gives NumPy's linear algebra one thread, for more
+would add in another order.  The number of devices does change bits; the cache of policies counts the mesh.
 """
 
 import os
@@ -37,8 +38,14 @@ DEFAULTS: Mapping[str, Any] = {
 }
 """Settings of JAX that change results or may, each with its default; they count where they differ from it."""
 
-ENVIRONMENT = ("LIBTPU_INIT_ARGS", "NVIDIA_TF32_OVERRIDE")
-"""Environment variables that accelerators read; they count where they are set."""
+ENVIRONMENT: Mapping[str, str] = {
+    "LIBTPU_INIT_ARGS": "",
+    "NPY_DISABLE_CPU_FEATURES": "",
+    "NVIDIA_TF32_OVERRIDE": "",
+    "OPENBLAS_CORETYPE": "",
+    "OPENBLAS_NUM_THREADS": "1",
+}
+"""Environment variables that accelerators and NumPy read, each with its default; they count where they differ."""
 
 HARMLESS = ("--xla_force_host_platform_device_count", "--xla_dump", "--xla_hlo_profile")
 """Flags of XLA that change no result."""
@@ -60,7 +67,9 @@ def settings() -> dict[str, Any]:
     found = {name: jax.config.values[name] for name in SETTINGS} | {FLAGS: flags}
     now = {name: jax.config.values.get(name, default) for name, default in DEFAULTS.items()}
     found |= {name: value for name, value in now.items() if value != DEFAULTS[name]}
-    return found | {name: os.environ[name] for name in ENVIRONMENT if os.environ.get(name)}
+    return found | {
+        name: os.environ[name] for name, usual in ENVIRONMENT.items() if os.environ.get(name, usual) != usual
+    }
 
 
 def require_same(before: Mapping[str, Any] | None, where: object) -> None:

@@ -284,7 +284,12 @@ def short_help(text: str) -> str:
 
 def _execute(experiment: Experiment[Any], command: Any, about: str, typed: str) -> int:
     stopping, directory = Stopping(), None
-    fate = lambda: f"Everything so far is in {directory}. To continue: {runs.continuing(typed)}"
+
+    def fate() -> str:
+        if directory is not None and runs.is_finished(directory):
+            return f"The run is finished: {directory}"
+        return f"Everything so far is in {directory}. To continue: {runs.continuing(typed)}"
+
     try:
         numerics.require_supported()
         require_memory({})
@@ -376,6 +381,7 @@ def _compute(
         runs.point_latest(directory)  # of a run without a loop or a line
     except BaseException as error:
         with contextlib.suppress(Exception):  # of the page must not hide what ended the run
-            page.end(error)
+            if not runs.is_finished(directory):  # else its page is the report
+                page.end(error)
         raise
     print_lines(f"report: {report}", *(results.verdict if command.scale != SMOKE else (f"{MEANINGLESS}.",)))

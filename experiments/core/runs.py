@@ -152,9 +152,14 @@ def started(home: Path) -> list[Path]:
     return sorted((p for p in found if not p.is_symlink() and (p / "config.json").exists()), reverse=True)
 
 
+def is_finished(directory: Path) -> bool:
+    """True of a run whose report and results are written."""
+    return (directory / "results.json").exists()
+
+
 def newest(home: Path, config: Any, *, finished: bool) -> Path | None:
     """The newest finished, or unfinished, run under `runs/NAME` with this configuration in JSON's types, or `None`."""
-    of_kind = (run for run in started(home) if (run / "results.json").exists() == finished)
+    of_kind = (run for run in started(home) if is_finished(run) == finished)
     return next((run for run in of_kind if read_description(run)["config"] == config), None)
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.core.artifacts import read_json, write_text
+from experiments.core.artifacts import read_times, write_text
 from experiments.core.curves import PhaseCurves, draw_phases
 from experiments.core.metric_log import read_metrics
 from experiments.core.progress import Loop, TrainingSample, Watcher
@@ -140,8 +140,7 @@ class LivePage(Watcher):
             thread.join()
 
     def _write(self, state: str, reload_s: int | None) -> None:
-        times = self._directory / "timing.json"
-        timing = read_json(times) if times.exists() else {}
+        timing = read_times(self._directory / "timing.json")
         spent = f"{duration(timing.pop('total', 0.0) + self._clock() - self._began)} so far"
         usual = "no run of this configuration has finished yet"
         if self._usual_s is not None:

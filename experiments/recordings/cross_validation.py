@@ -2,7 +2,7 @@
 
 import dataclasses
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from experiments.core.errors import ConfigurationError
 from experiments.core.results import Cell, Table, named_table
 from experiments.recordings.descriptions import AuxiliaryData, DescribedVideos
 from experiments.recordings.learning import LearnConfig, answer_log_probs, learn
-from experiments.recordings.level_probes import GROUPS, READINGS, SCENES, ProbedVideos
+from experiments.recordings.level_probes import GROUPS, READINGS, SCENES, LevelProbeConfig, ProbedVideos
 from sensors_io.touches import families
 from touchr1_jax.bench.metrics import Scores, accuracy, mean_accuracy, ordinal_mae
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
@@ -33,6 +33,33 @@ SCORES: Mapping[str, str] = {
 """Reported scores and their meaning; all but OMAE in per cent."""
 
 FORMATS, UNITS = dict.fromkeys(SCORES, ".1f") | {"OMAE": ".3f"}, dict.fromkeys(SCORES, "%") | {"OMAE": ""}
+
+
+def require_divisions(seeds: Sequence[int], folds: int, probes: LevelProbeConfig) -> None:
+    """Refuse partitions and probes that cannot be fitted, before videos are read and scenes are made.
+
+    Raises:
+      ConfigurationError: naming the field, its value and the constraint.
+    """
+    if not seeds or len(set(seeds)) < len(seeds):
+        raise ConfigurationError(f"seeds is {tuple(seeds)}: must be different seeds, at least one; correct it")
+    for name, count in (("folds", folds), ("learn.evidence.folds", probes.folds)):
+        if count < 2:
+            raise ConfigurationError(f"{name} is {count}: must be at least 2, or nothing is left to fit on; raise it")
+    for name in ("ridge", "scene_ridge"):
+        if not getattr(probes, name) > 0:
+            raise ConfigurationError(f"learn.evidence.{name} is {getattr(probes, name)}: must be above 0; raise it")
+    known, read = {*families(), *SCENES}, {name for of in probes.by_attribute for name in of}
+    if not probes.families or set(probes.families) - known or read - set(probes.families):
+        raise ConfigurationError(
+            f"learn.evidence.families is {probes.families}: must hold those of by_attribute {probes.by_attribute} and "
+            f"some of {', '.join(sorted(known))}; correct it"
+        )
+    if len(probes.by_attribute) not in (0, len(LANGUAGE.attributes)) or not all(probes.by_attribute):
+        raise ConfigurationError(
+            f"learn.evidence.by_attribute is {probes.by_attribute}: must be empty, or hold families for each of "
+            f"{len(LANGUAGE.attributes)} attributes; correct it"
+        )
 
 
 def deal_folds(objects: np.ndarray, label: Int[np.ndarray, "n A"], count: int, seed: int) -> Int[np.ndarray, "n"]:

@@ -41,6 +41,7 @@ from experiments.recordings.cross_validation import (
     marginals,
     people,
     pool,
+    require_divisions,
     score_table,
 )
 from experiments.recordings.descriptions import (
@@ -94,6 +95,9 @@ class PhysiclearStudy:
     """Scenes that are generated for training, in addition to the videos."""
     scene_sets: int = 3  # sets of them, of consecutive seeds, whose probes are averaged
     learn: LearnConfig = LearnConfig()
+
+    def __post_init__(self) -> None:
+        require_divisions(self.seeds, self.folds, self.learn.evidence)
 
 
 def run(config: PhysiclearStudy, context: Context) -> Results:

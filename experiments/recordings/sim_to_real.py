@@ -33,7 +33,15 @@ from experiments.core.errors import ConfigurationError
 from experiments.core.results import Picture, Results, Table, named_table
 from experiments.core.runner import Experiment
 from experiments.core.text import bounds, interval
-from experiments.recordings.cross_validation import FORMATS, UNITS, CrossValidation, deal_folds, intervals, scores
+from experiments.recordings.cross_validation import (
+    FORMATS,
+    UNITS,
+    CrossValidation,
+    deal_folds,
+    intervals,
+    require_divisions,
+    scores,
+)
 from experiments.recordings.descriptions import DescribedVideos, auxiliary_data, describe_scenes, describe_source
 from experiments.recordings.findings import JudgedAnswers, gains
 from experiments.recordings.learning import LearnConfig
@@ -77,6 +85,9 @@ class SimToRealStudy:
     scenes: SceneConfig = SceneConfig(objects=800, sites=1)
     scene_sets: int = 2  # sets of consecutive seeds, whose probes are averaged
     learn: LearnConfig = LearnConfig()
+
+    def __post_init__(self) -> None:
+        require_divisions(self.seeds, self.folds, self.learn.evidence)
 
 
 def run(config: SimToRealStudy, context: Context) -> Results:

@@ -1,6 +1,7 @@
 """Arrays of files from outside: equal to NumPy's, or refused."""
 
 import contextlib
+import os
 
 import numpy as np
 import pytest
@@ -36,6 +37,12 @@ def npy(header):
 def test_what_is_no_array_is_refused(tmp_path, data, message):
     (tmp_path / "a.npy").write_bytes(data)
     refused(ArraysError, message, load_arrays, tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.npz"])
+def test_a_pipe_is_refused(tmp_path, name):
+    os.mkfifo(tmp_path / name)
+    refused(ArraysError, "a pipe", load_arrays, tmp_path / name)
 
 
 @pytest.mark.long

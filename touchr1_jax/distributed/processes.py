@@ -23,6 +23,8 @@ from touchr1_jax.training.loop import SingleDevice
 
 GIB = 2**30
 
+MOST_PROCESSES, MOST_PORT = 2**20, 2**16 - 1
+
 MESSAGE_BYTES = 8192
 """Longest value that process 0 can send to the others: twice Linux's longest path."""
 
@@ -40,7 +42,7 @@ class Launch:
     """The processes and devices of a run.  No part of its configuration: it can continue on others.
 
     Raises:
-      ValueError: an incomplete address, an address of a run that is not distributed, a process beyond the last.
+      ValueError: an incomplete or impossible address, one of a run that is not distributed, a process beyond the last.
     """
 
     distributed: bool = False
@@ -65,6 +67,13 @@ class Launch:
             raise ValueError(f"coordinator is {self.coordinator}, but the run is not distributed; add --distributed")
         if self.processes is not None and not 0 <= (self.process or 0) < self.processes:
             raise ValueError(f"process is {self.process}: must be 0 … {self.processes - 1}, one of the processes")
+        if self.processes is not None and self.processes > MOST_PROCESSES:
+            raise ValueError(f"processes is {self.processes}: must be at most {MOST_PROCESSES:,}; lower it")
+        host, _, port = ("host:1" if self.coordinator is None else self.coordinator).rpartition(":")
+        if not host or not port.isdecimal() or not 1 <= int(port) <= MOST_PORT:  # JAX would wait for it for minutes
+            raise ValueError(
+                f"coordinator is {self.coordinator!r}: must be HOST:PORT, 1 ≤ PORT ≤ {MOST_PORT}; correct it"
+            )
 
 
 @dataclasses.dataclass(frozen=True)

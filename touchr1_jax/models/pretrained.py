@@ -66,7 +66,7 @@ def load_encoder(path: Path) -> PretrainedEncoder:
       EncoderError: there is no such file, it is no encoder, or one of another version of its config.
     """
     path = path / "encoder.npz" if path.is_dir() else path
-    if not path.exists():
+    if not path.is_file():
         raise EncoderError(f"encoder is {path}: no such file; give the run directory of pretrain_encoder")
     fix = "give a file that pretrain_encoder wrote"
     try:

@@ -50,7 +50,6 @@ CHECKSUM = "checksum"
 Precision = Literal["float32", "float16", "int8"]
 """Type of the stored parameters; `int8` stores a matrix as 127 steps of each output's largest weight."""
 
-
 MISFITS = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError, AssertionError)
 """Errors that a config of another version raises where it is read."""
 
@@ -326,8 +325,9 @@ def read_sealed(folder: Path, wanted: str, newest: int) -> dict[str, Any]:
 
 def format_of(folder: Path) -> str | None:
     """The `model_type` of a folder, if it has one."""
+    path = folder / CONFIG_FILE
     try:
-        return json.loads((folder / CONFIG_FILE).read_text(encoding="utf-8"))["model_type"]
+        return json.loads(path.read_text(encoding="utf-8"))["model_type"] if path.is_file() else None  # no pipe
     except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return None
 

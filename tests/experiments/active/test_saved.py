@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 
 import jax
 import numpy as np
@@ -97,5 +98,11 @@ def test_parameters_that_answer_nothing_are_refused(drawn, tmp_path, change, mes
 
 def test_other_folders_are_no_explorers(tmp_path):
     assert not is_explorer(tmp_path)
-    (tmp_path / "config.json").write_text("[]")
+    for text in ("[]", "[" * 200_000):
+        (tmp_path / "config.json").write_text(text)
+        assert not is_explorer(tmp_path)
+    (tmp_path / "config.json").unlink()
+    os.mkfifo(tmp_path / "config.json")
     assert not is_explorer(tmp_path)
+    with pytest.raises(PolicyError, match="a pipe"):
+        read_explorer(tmp_path)

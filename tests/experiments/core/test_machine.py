@@ -63,6 +63,11 @@ def test_a_run_is_refused_before_it_begins(tmp_path, capsys):
         ({"process": None}, r"process is not given, .*; give all three or none"),
         ({"distributed": False}, r"coordinator is h:1, but the run is not distributed; add --distributed"),
         ({"process": 2}, r"process is 2: must be 0 … 1, one of the processes"),
+        ({"processes": 2**31}, "processes is 2147483648: must be at most"),
+        *(
+            ({"coordinator": odd}, f"coordinator is '{odd}': must be HOST:PORT")
+            for odd in ("host", "host:", ":1", "host:99999", "host:0", "host:x", "host:²", "")
+        ),
     ],
 )
 def test_an_address_is_whole(changes, message):

@@ -1,5 +1,9 @@
 """Settings that change bits are recorded, compared when a run continues, or refused."""
 
+import os
+import subprocess
+import sys
+
 import jax
 import pytest
 
@@ -33,9 +37,29 @@ def test_flags_in_a_file_and_variables_of_accelerators_are_settings(monkeypatch,
     monkeypatch.setenv(FLAGS, str(tmp_path / "flags"))
     (tmp_path / "flags").write_text("--xla_cpu_enable_fast_math=true\n--xla_dump_to=/tmp/x\n")
     assert numerics.settings()[FLAGS] == ["--xla_cpu_enable_fast_math=true"]
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
     before = numerics.settings()
-    monkeypatch.setenv("NVIDIA_TF32_OVERRIDE", "1")
-    assert numerics.changed(before, numerics.settings()) == ("NVIDIA_TF32_OVERRIDE was None and is '1'",)
+    for name, value in (
+        ("NVIDIA_TF32_OVERRIDE", "1"),
+        ("NPY_DISABLE_CPU_FEATURES", "AVX512_SKX"),
+        ("OPENBLAS_CORETYPE", "Haswell"),
+        ("OPENBLAS_NUM_THREADS", "2"),
+    ):
+        with monkeypatch.context() as one:
+            one.setenv(name, value)
+            assert numerics.settings() == {**before, name: value}
+
+
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="one core gives one thread")
+def test_cores_change_no_bit_of_linear_algebra():
+    source = (
+        "import os, sys; os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: int(sys.argv[1])]);"
+        "import experiments.__main__, numpy as np; x = np.random.default_rng(0).normal(size=(600, 200));"
+        "print(float(np.linalg.solve(x.T @ x + np.eye(200), x.T[:, :3]).sum()).hex())"
+    )
+    env = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    run = lambda cores: subprocess.run([sys.executable, "-c", source, cores], env=env, check=True, capture_output=True)
+    assert run("1").stdout == run("2").stdout
 
 
 @pytest.mark.long

@@ -193,3 +193,16 @@ def test_a_signal_stops_cleanly_and_prints_how_to_continue(workplace, monkeypatc
     assert [json.loads(line)["step"] for line in lines] == list(range(5))
     assert not (directory / "results.json").exists()
     assert not list(directory.rglob(".*.json.*")), "half-written files were left behind"
+
+
+def test_a_signal_after_the_results_leaves_the_report(workplace, monkeypatch, capsys):
+    """The page of a finished run is its report, and there is nothing to continue."""
+    point = runs.point_latest
+    strike = lambda directory: (directory / "results.json").exists() and signal.raise_signal(signal.SIGTERM)
+    monkeypatch.setattr(runs, "point_latest", lambda directory: (point(directory), strike(directory)))
+    assert run("coin", "--scale", "smoke") == 143
+    (directory,) = directories()
+    assert "Data and time" in (directory / "report.html").read_text()
+    out = capsys.readouterr().out
+    assert f"is finished: {directory}" in out
+    assert "To continue" not in out

@@ -87,6 +87,25 @@ def test_a_kept_policy_answers_for_a_folder(run):
     assert json.loads(out.read_text()).keys() == {"new.avi", "thing5_0.avi", "together"}
 
 
+@pytest.mark.parametrize("name", ["physiclear", "sim_to_real"])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--seeds", "seeds is ()"),
+        ("--seeds 7 7", "must be different seeds"),
+        ("--folds 1", "folds is 1: must be at least 2"),
+        ("--learn.evidence.folds 1", "learn.evidence.folds is 1"),
+        ("--learn.evidence.ridge 0", "learn.evidence.ridge is 0.0: must be above 0"),
+        ("--learn.evidence.families x", "learn.evidence.families is ('x',)"),
+        ("--learn.evidence.families edges", "must hold those of by_attribute"),
+    ],
+)
+def test_what_cannot_be_fitted_is_refused_before_videos_are_read(name, arguments, message, tmp_path, capsys):
+    assert main([name, *arguments.split(), "--data-dir", "x", "--runs-dir", str(tmp_path)]) == 2
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"), [(["--predict", "x"], "give both to predict"), ([], "data_dir is None")]
 )

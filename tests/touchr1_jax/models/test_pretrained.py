@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import json
+import os
 
 import jax
 import numpy as np
@@ -46,6 +47,9 @@ def test_sensors_are_picked_by_name(encoder):
 def test_what_is_no_encoder_is_refused(encoder, tmp_path):
     with pytest.raises(EncoderError, match=r"no such file; give the run directory of pretrain_encoder"):
         load_encoder(tmp_path)
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(EncoderError, match="no such file"):
+        load_encoder(tmp_path / "pipe")
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     with pytest.raises(ValueError, match="it has no entry 'about'"):
         load_encoder(tmp_path / "other.npz")

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import hashlib
 import json
+import os
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -88,6 +89,7 @@ def test_a_policy_is_replaced_and_nothing_else_is(saved, folder):
     assert read_policy(folder).notes == {"name": "second"}
     (folder.parent / "thesis").mkdir()
     (folder.parent / "thesis" / "text").write_text("x")
+    os.mkfifo(folder.parent / "thesis" / "config.json")  # is not waited for
     with pytest.raises(PolicyError, match="exists and is no policy"):
         save_policy(folder.parent / "thesis", saved)
     assert (folder.parent / "thesis" / "text").read_text() == "x"
