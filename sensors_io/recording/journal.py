@@ -7,6 +7,7 @@ Every entry is one `writev`, after which its bytes belong to the kernel: whateve
 reach the file.  A loss of power may cost what was written since the last `fsync`, at most a second.
 """
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -50,7 +51,7 @@ class JournalWriter:
     """
 
     def __init__(self, path: pathlib.Path):
-        self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
+        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
         self._synced_s = time.monotonic()
 
     def append(self, kind: str, plain: Mapping[str, Any], **arrays: np.ndarray) -> None:
@@ -73,9 +74,18 @@ class JournalWriter:
             os.fdatasync(self._file)
             self._synced_s = now_s
 
-    def restart(self) -> None:
-        """Forget all entries."""
+    @property
+    def size(self) -> int:
+        """Bytes of all entries so far."""
+        return os.fstat(self._file).st_size
+
+    @contextlib.contextmanager
+    def only_since(self, size: int) -> Iterator[None]:
+        """Forget the entries before a former `size`; what the block appends precedes the others."""
+        others = os.pread(self._file, self.size - size, size)
         os.ftruncate(self._file, 0)
+        yield
+        self._write([others])
 
     def close(self) -> None:
         """Bring everything to the disk."""

@@ -28,7 +28,7 @@ from sensors_io.records import RecordsMeta, RecordWriter
 from sensors_io.schema import ContactKey, Phase, SchemaError
 
 _JOURNALS = ".journals"
-_UNTOUCHED_S = 20.0  # kept of the time before the first touch; a contact is stored from memory, a pause may be long
+_UNTOUCHED_S = 10.0  # kept of a pause before the first touch, or twice as much: a contact is stored from memory
 _IDLE_S = 0.002  # between looks at the devices; a tenth of the fastest camera's period
 
 
@@ -188,7 +188,7 @@ class _Session:
         """Read until the coach says done; whether the contact is complete."""
         phase: Phase | None = None
         advice: Advice | None = None
-        since_ns: int | None = None
+        waiting: tuple[int, Phase | None, int] | None = None  # time, phase and size of the journal
         while not self._stop():
             looked = [stream.look() for stream in self._streams]
             times, forces = self._forces(looked, journal)
@@ -199,11 +199,11 @@ class _Session:
                     journal.append("phase", {"time_ns": int(at), "phase": int(phase)})
             self._take(looked, advice, journal)
             if len(times) and not coach.begun:
-                since_ns = int(times[0]) if since_ns is None else since_ns
-                if times[-1] - since_ns > _UNTOUCHED_S * NS_PER_S:
-                    journal.restart()
-                    begin()
-                    phase = since_ns = None
+                now = int(times[-1]), phase, journal.size
+                waiting = waiting or now
+                if now[0] - waiting[0] > _UNTOUCHED_S * NS_PER_S:
+                    _forget_before(waiting, journal, begin)
+                    waiting = (now[0], phase, journal.size)
             if advice is not None:
                 self._show(self._status(stage, advice))
                 if advice.done:
@@ -283,6 +283,15 @@ class _Session:
             force=None if self._force is None else self._force.counts,
             alarm=self._alarm,
         )
+
+
+def _forget_before(then: tuple[int, Phase | None, int], journal: JournalWriter, begin: Callable[[], None]) -> None:
+    """Keep of a contact what was journaled since a time, at which it had a phase and the journal a size."""
+    time_ns, phase, size = then
+    with journal.only_since(size):
+        begin()
+        if phase is not None:
+            journal.append("phase", {"time_ns": time_ns, "phase": int(phase)})
 
 
 def _stacked(samples: list[Sample], name: str, lacking: float = np.nan) -> np.ndarray:
