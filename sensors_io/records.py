@@ -65,8 +65,8 @@ class RecordWriter:
       kept: names of files that no index lists and that are no remains: parts that are adopted later.
 
     Raises:
-      RecordsExistError: the directory holds records and `resume` is off, or they were made by another config, or
-        another process is writing them.
+      RecordsExistError: the directory holds records and `resume` is off, or they were made by another config or have
+        another licence, or another process is writing them.
     """
 
     def __init__(
@@ -365,6 +365,11 @@ def _start(root: pathlib.Path, meta: RecordsMeta, resume: bool, kept: Callable[[
                 f"{root} holds {_content(root, index)}, made by config {index.meta.config_hash!r}, not "
                 f"{meta.config_hash!r}: one directory holds records of one making; choose another directory, or resume "
                 "with the options that made these; nothing was changed"
+            )
+        if index.meta.licence != meta.licence:
+            raise RecordsExistError(
+                f"{root} holds records of licence {index.meta.licence!r}, not {meta.licence!r}: one directory has one "
+                "licence; choose another directory, or name that one; nothing was changed"
             )
         convert(root, index)
         index.complete = False

@@ -211,6 +211,13 @@ def test_a_device_that_fails_for_good_leaves_its_contact_in_the_records(tmp_path
     assert [(k.motion, k.trial) for k in store.contacts] == [("press", 0), ("press", 1), ("slide_x", 0)]
 
 
+def test_another_licence_is_refused(tmp_path):
+    config = dataclasses.replace(SHORT, stages=SHORT.stages[:1])
+    session(tmp_path, Hand(), config)
+    other = dataclasses.replace(config, licence="CC0")
+    refused(RecordsExistError, "not 'CC0': one directory has one licence", session, tmp_path, Hand(), other)
+
+
 def test_a_pause_before_the_first_touch_is_not_recorded(tmp_path):
     """Of a minute without a touch the last 10 to 20 s are kept: all would not fit into memory when it is stored."""
 
