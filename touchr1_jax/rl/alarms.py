@@ -68,6 +68,11 @@ class AlarmRule:
         return Alarm(code=self.code, meaning=self.meaning, value=value, bound=self.bound)
 
 
+def of_candidates(metrics: Metrics, name: str) -> float:
+    """A metric of all candidates, also under dynamic sampling, which selects groups that are half right at any time."""
+    return metrics.get(f"drawn_{name}", metrics[name])
+
+
 def middle_excess(now: Metrics, start: Metrics) -> float:
     """F1: share of middle answers above the share of middle labels, whatever the number of levels."""
     del start
@@ -129,24 +134,18 @@ def idle_groups(now: Metrics, start: Metrics) -> float | None:
     sampling these are shares of all candidates (`drawn_…` in the log), because the selected groups hide those that
     were not selected.
     """
-    if "idle_share" not in now or of_candidates(now, "accuracy") > of_candidates(
-        start, "accuracy"
-    ):  # older logs have none
+    if "idle_share" not in now:  # no line of older logs has it
+        return None
+    if of_candidates(now, "accuracy") > of_candidates(start, "accuracy"):
         return None
     unsolved = of_candidates(now, "unsolved_share")
     return of_candidates(now, "idle_share") / unsolved if unsolved > 0 else 0.0
 
 
-def of_candidates(metrics: Metrics, name: str) -> float:
-    """A metric of all candidates, also under dynamic sampling, which selects groups that are half right at any time."""
-    return metrics.get(f"drawn_{name}", metrics[name])
-
-
 def heavy_tail(now: Metrics, start: Metrics) -> float | None:
     """F8: the largest penalty of a token, β times its KL in units of the advantage, while answers get worse."""
-    return (
-        now.get("kl_cost_peak") if of_candidates(now, "accuracy") < of_candidates(start, "accuracy") - WORSE else None
-    )
+    worse = of_candidates(now, "accuracy") < of_candidates(start, "accuracy") - WORSE
+    return now.get("kl_cost_peak") if worse else None
 
 
 def entropy_collapse(now: Metrics, start: Metrics) -> float | None:
