@@ -54,12 +54,14 @@ def test_stable_preset():
 
 
 def test_published_variants():
-    assert (Dapo().clip_low, Dapo().clip_high, Dapo().average, Dapo().beta) == (0.2, 0.28, Average.TOKEN, 0.0)
+    assert (Dapo().clip_low, Dapo().clip_high, Dapo().average) == (0.2, 0.28, Average.TOKEN)
     assert (DrGrpo().advantage, DrGrpo().average) == (Advantage.NONE, Average.LENGTH)
     assert (Rloo().advantage, Rloo().average) == (Advantage.LEAVE_ONE_OUT, Average.LENGTH)
     assert (ReinforcePlusPlus().advantage, ReinforcePlusPlus().average) == (Advantage.GLOBAL, Average.TOKEN)
     assert (Gspo().surrogate, Gspo().clip_low, Gspo().clip_high) == (Surrogate.SEQUENCE, 3e-4, 4e-4)
-    assert Cispo().surrogate is Surrogate.CISPO
+    assert (Cispo().surrogate, Cispo().clip_low, Cispo().clip_high) == (Surrogate.CISPO, 1.0, 4.0)
+    assert Cispo().average is Average.TOKEN
+    assert {(of().beta, of().gamma) for of in (Dapo, DrGrpo, Rloo, ReinforcePlusPlus, Gspo, Cispo)} == {(0.0, 0.0)}
     assert GRPOConfig(prompts=8, algorithm=Dapo()).drawn == 16
 
 
