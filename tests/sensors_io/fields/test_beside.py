@@ -53,6 +53,14 @@ def job(records: pathlib.Path, **changes) -> FieldsJob:
     return FieldsJob(**values | changes)
 
 
+def test_a_frame_is_followed_from_the_one_before_it_in_its_recording():
+    """Also when the recording is read again: its first frame follows none."""
+    extractor, frames = Extractor(dotted(), 0.1), np.stack([dotted(8.0), dotted(8.0), dotted(14.0)])
+    for _ in range(2):
+        moved = recorded_fields(recorded(frames=frames), extractor).deformation_mm
+        np.testing.assert_allclose(np.median(moved[..., 0], (1, 2)), [0.8, 0.8, 1.4], atol=0.02)
+
+
 def test_fields_lie_beside_the_pictures(tmp_path):
     records, out = written(tmp_path / "records"), tmp_path / "fields"
     put_rest_pictures(records, {"rest.png": b"a picture"})
