@@ -369,7 +369,7 @@ def _start(root: pathlib.Path, meta: RecordsMeta, resume: bool, kept: Callable[[
         if index.meta.licence != meta.licence:
             raise RecordsExistError(
                 f"{root} holds records of licence {index.meta.licence!r}, not {meta.licence!r}: one directory has one "
-                "licence; choose another directory, or name that one; nothing was changed"
+                "licence; choose another directory, or give the licence that is there; nothing was changed"
             )
         convert(root, index)
         index.complete = False

@@ -126,7 +126,7 @@ def fitting(path: Path | str) -> Iterator[None]:
 
 
 def read_times(path: Path) -> dict[str, float]:
-    """Seconds by stage in the `timing.json` of a run, none before the first one; `DamagedFileError` if damaged."""
+    """Seconds by stage in the `timing.json` of a run, empty before any was timed; `DamagedFileError` if damaged."""
     found = read_json(path) if path.exists() else {}
     with fitting(path):
         return {name: float(seconds) for name, seconds in found.items()}

@@ -96,8 +96,6 @@ class Context:
         """
         _checked(stage)
         if self._log is not None:
-            if not self._log.has_begun(stage):
-                self.rewind(stage, step)
             self._log.append(stage, step, scalars)
 
     def sampled(self, stage: str, step: int, sample: TrainingSample) -> None:
@@ -110,7 +108,7 @@ class Context:
         """Drop the logged lines of a stage at or past a step; needed only where the first new line may come later."""
         _checked(stage)
         if self._log is not None:
-            write_sealed(self._stage_file(f"{_LOGGED}/{stage}"), {"lines": summary([])})  # the run has this stage
+            self._stage_file(f"{_LOGGED}/{stage}").unlink(missing_ok=True)
             self._log.rewind(stage, step)
 
     def ended(self, stage: str) -> None:
@@ -121,17 +119,11 @@ class Context:
             )
 
     def require_log(self) -> None:
-        """`DamagedFileError` unless the log has all lines of stages that have ended, and none of another run's stages.
-
-        No other look may be taken.
-        """
+        """`DamagedFileError` unless the log has the lines of all stages that have ended; no other look may be taken."""
         folder = self.directory / "stages" / _LOGGED
         if self._log is None:
             return
-        lines, timed = self._log.by_stage(), self.timing()
-        for stage in lines:  # earlier versions kept only the times of a stage that had not ended
-            if not (folder / f"{stage}.json").exists() and stage not in timed:
-                raise damaged_log(self.directory / "metrics.jsonl", f"this run has begun no stage {stage!r}")
+        lines = self._log.by_stage()
         for path in sorted(folder.rglob("*.json")):
             stage, kept = path.relative_to(folder).with_suffix("").as_posix(), read_json(path)
             with fitting(path):

@@ -29,10 +29,6 @@ class MetricLog:
         write_text(path, "".join(_whole_lines(path)))  # drops a line that a crash tore
         self._file = path.open("a", encoding="utf-8")
 
-    def has_begun(self, stage: str) -> bool:
-        """True of a stage that was logged or rewound in this session."""
-        return stage in self._seen
-
     def rewind(self, stage: str, step: int) -> None:
         """Drop the lines of a stage at or past a step: they are about to be computed again."""
         before = lambda row: row["stage"] != stage or row["step"] < step

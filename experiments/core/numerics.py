@@ -74,7 +74,7 @@ def settings() -> dict[str, Any]:
 
 def require_same(before: Mapping[str, Any] | None, where: object) -> None:
     """Refuse to continue a run in `where` under other settings than it began with; older runs recorded none."""
-    found = () if before is None else changed(before, settings())
+    found = () if before is None else changed({**ENVIRONMENT, **before}, {**ENVIRONMENT, **settings()})
     if found:
         raise ConfigurationError(
             f"{where} cannot be resumed with bit-identical results: {'; '.join(found)}; set them as they were, or "

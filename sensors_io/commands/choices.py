@@ -128,7 +128,8 @@ def readers(configs: Seq[AnyConfig], *, numbers: bool = False) -> Iterator[list[
         names = [reader.identity.sensor for reader in made]
         if len(set(names)) != len(names):
             raise DeviceNotFoundError(
-                f"devices are {names}: each name once; name them apart, such as --sensor gelsight_mini.left"
+                f"devices are {names}: each name once; name cameras apart, such as --sensor gelsight_mini.left; of two "
+                "Tac3D sensors, or two replays of records, leave one out"
             )
         yield made
 

@@ -14,7 +14,7 @@ MOST = 1e15
 
 
 def require_possible(value: Any, where: str = "") -> None:
-    """Refuse numbers that are no quantity, times below 0, no ports, and paths of pipes and devices, in all fields.
+    """Refuse numbers that are no quantity, times below 0, ports beyond the last, pipes and devices, in all fields.
 
     A pipe or a device is read without end, or not at all, and an output is renamed onto its path.
 

@@ -98,7 +98,7 @@ class VideoFile:
         capture.release()
         if not 0 < rate <= NS_PER_S:
             raise DeviceNotFoundError(
-                f"{self.path} states {rate:g} frames a second: must be > 0; write it anew with one"
+                f"{self.path} states {rate:g} frames a second: must lie in (0, 10⁹]; write it anew with its true rate"
             )
         return rate
 

@@ -278,7 +278,8 @@ def load_recording(path: pathlib.Path) -> Tac3dArrays:
         raise DeviceDataError(f"{path} holds {sorted(arrays)}: index and sendTimestamp must be among them")
     matrices = {name: a for name, a in arrays.items() if name.startswith("3D_")}
     for name in ("index", "sendTimestamp", "recvTimestamp", *matrices):
-        _require_numbers(path, name, arrays.get(name, arrays["index"]))
+        if name in arrays:
+            _require_numbers(path, name, arrays[name])
     index, times = arrays["index"].ravel(), arrays["sendTimestamp"].ravel().astype(np.float64)
     received = arrays["recvTimestamp"].ravel().astype(np.float64) if "recvTimestamp" in arrays else None
     if any(

@@ -240,7 +240,7 @@ class _Force:
 
 
 def _gaps(time_ns: np.ndarray, index: Seq[int | None], period_s: float | None) -> np.ndarray:
-    """Frames before which one is missing or the counter began anew, by the counter or else by the period."""
+    """Frames at which the counter does not go on by one, or, without a counter, that come too late for the period."""
     counter = [i for i in index if i is not None]
     if len(counter) == len(index):
         return np.diff(np.array(counter, np.int64), prepend=counter[0] - 1) != 1

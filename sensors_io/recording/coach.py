@@ -114,21 +114,19 @@ class Coach:
 
     def step(self, time_ns: int, force_n: np.ndarray) -> Advice:
         """Take one force [3] on the gel into account; one that is not finite is none, and changes nothing."""
-        finite = bool(np.isfinite(force_n).all())
-        normal = self._normal = -float(force_n[2]) if finite else self._normal
-        if not finite:
-            pass
-        elif not self._armed:
-            self._arm(time_ns, normal)
-        elif not self._done:
-            self._advance(time_ns, normal)
+        if np.isfinite(force_n).all():
+            self._normal = -float(force_n[2])
+            if not self._armed:
+                self._arm(time_ns, self._normal)
+            elif not self._done:
+                self._advance(time_ns, self._normal)
         return Advice(
-            prompt=self._prompt(normal),
+            prompt=self._prompt(self._normal),
             phase=self._phase,
             recording=self._armed and not self._done,
             done=self._done,
             complete=self._complete,
-            normal_n=normal,
+            normal_n=self._normal,
             target_n=self._stage.force_n,
         )
 

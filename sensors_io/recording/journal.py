@@ -82,10 +82,13 @@ class JournalWriter:
     @contextlib.contextmanager
     def only_since(self, size: int) -> Iterator[None]:
         """Forget the entries before a former `size`; what the block appends precedes the others."""
-        others = os.pread(self._file, self.size - size, size)
+        others, at = list[bytes](), size
+        while part := os.pread(self._file, self.size - at, at):  # at most 2 GiB at a time
+            others.append(part)
+            at += len(part)
         os.ftruncate(self._file, 0)
         yield
-        self._write([others])
+        self._write(others)
 
     def close(self) -> None:
         """Bring everything to the disk."""

@@ -28,7 +28,7 @@ from sensors_io.records import RecordsMeta, RecordWriter
 from sensors_io.schema import ContactKey, Phase, SchemaError
 
 _JOURNALS = ".journals"
-_UNTOUCHED_S = 10.0  # kept of a pause before the first touch, or twice as much: a contact is stored from memory
+_UNTOUCHED_S = 10.0  # of a pause before the first touch the last 10 to 20 s are kept: contacts are stored from memory
 _IDLE_S = 0.002  # between looks at the devices; a tenth of the fastest camera's period
 
 

@@ -120,7 +120,6 @@ class Stream:
 
     def begin(self) -> dict[str, Any]:
         """First entry of a journal: identity, delay, counts, and the drift of the background."""
-        self.frames = 0
         identity = dataclasses.asdict(self.feed.identity)
         drift = self._background.drift()
         return {
@@ -133,6 +132,7 @@ class Stream:
     def end(self) -> None:
         """Forget the frames that came after a contact."""
         self._before.clear()
+        self.frames = 0
 
     def status(self) -> StreamStatus:
         """State for display."""

@@ -69,11 +69,12 @@ class Launch:
             raise ValueError(f"process is {self.process}: must be 0 … {self.processes - 1}, one of the processes")
         if self.processes is not None and self.processes > MOST_PROCESSES:
             raise ValueError(f"processes is {self.processes}: must be at most {MOST_PROCESSES:,}; lower it")
-        host, _, port = ("host:1" if self.coordinator is None else self.coordinator).rpartition(":")
-        if not host or not port.isdecimal() or not 1 <= int(port) <= MOST_PORT:  # JAX would wait for it for minutes
-            raise ValueError(
-                f"coordinator is {self.coordinator!r}: must be HOST:PORT, 1 ≤ PORT ≤ {MOST_PORT}; correct it"
-            )
+        if self.coordinator is not None:
+            host, _, port = self.coordinator.rpartition(":")
+            if not host or not port.isdecimal() or not 1 <= int(port) <= MOST_PORT:  # JAX would wait for minutes
+                raise ValueError(
+                    f"coordinator is {self.coordinator!r}: must be HOST:PORT, 1 ≤ PORT ≤ {MOST_PORT}; correct it"
+                )
 
 
 @dataclasses.dataclass(frozen=True)

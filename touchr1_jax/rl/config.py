@@ -240,7 +240,7 @@ class Stable(Algorithm):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Dapo(Algorithm):
-    """DAPO (arXiv 2503.14476): clip .2/.28, mean over tokens, dynamic sampling, no KL; the reward `overlong` is its."""
+    """DAPO (arXiv 2503.14476): clip .2/.28, tokens averaged, dynamic sampling, no KL; `overlong` penalises length."""
 
     clip_high: float = 0.28
     average: Average = Average.TOKEN
