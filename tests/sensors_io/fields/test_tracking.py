@@ -108,7 +108,7 @@ def test_a_picture_turned_over_gives_the_points_turned_over():
 def test_wrong_pictures_are_refused(tracker):
     refused(ValueError, r"must be uint8\[160, 200\]", tracker.track, REST[:-1])
     refused(ValueError, "must lie inside the picture", lambda: Patches(REST, np.array([[3.0, 50.0]]), 7))
-    refused(ValueError, "must lie inside the picture", lambda: Patches(REST, np.array([[193.0, 150.0]]), 7))
+    refused(ValueError, "must lie inside the picture", lambda: Patches(REST, np.array([[150.0, 153.0]]), 7))
     corner = Patches(REST, np.array([[192.0, 152.0]]), 7)  # the last window inside
     assert corner.find(np.zeros_like(REST), np.array([[192.0, 152.0]])).likeness.tolist() == [0.0]
     refused(ValueError, "back_px is 0", TrackingConfig, back_px=0)
