@@ -13,7 +13,14 @@ import pytest
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.training.stand_in import read_torch
 from touchr1_jax.rl.config import GRPOConfig, Paper
-from touchr1_jax.rl.served import completion_request, embedded_prompts, torch_file
+from touchr1_jax.rl.served import (
+    TOKEN,
+    RolloutError,
+    completion_request,
+    embedded_prompts,
+    read_completions,
+    torch_file,
+)
 
 KINDS = [np.float32, ml_dtypes.bfloat16]
 
@@ -93,3 +100,29 @@ def test_a_request_says_all_that_a_generation_config_could_change(centred, logpr
         "presence_penalty": 0.0,
         "frequency_penalty": 0.0,
     }
+
+
+def completed(index: int, ids: list[int], heads: int) -> dict:
+    """A completion of tokens at log-probability −.5, with so many of the most likely tokens of each place."""
+    best = {f"{TOKEN}{i}": -0.5 - n for n, i in enumerate(np.flatnonzero(~tiny.TOKENIZER.banned)[:heads].tolist())}
+    return {
+        "index": index,
+        "token_ids": ids,
+        "logprobs": {"token_logprobs": [-0.5] * len(ids), "top_logprobs": [best] * len(ids)},
+    }
+
+
+def test_completions_become_arrays_that_are_0_after_the_end():
+    config = GRPOConfig(group=2, length=3, algorithm=Paper(score_centering=2))
+    free = int(np.flatnonzero(~tiny.TOKENIZER.banned)[3])
+    answer = {"choices": [completed(1, [free, free, 1], heads=3), completed(0, [1], heads=2)]}
+    found = read_completions(answer, config, tiny.FNS)
+    np.testing.assert_array_equal(found.mask, [[True, False, False], [True, True, True]])
+    np.testing.assert_array_equal(found.log_prob, -0.5 * found.mask)
+    assert found.tokens[1].tolist() == [free, free, 1]
+    np.testing.assert_array_equal(found.head_log_prob[1], [[-0.5] * 3, [-1.5] * 3])
+    few = {"choices": [completed(0, [1], heads=2), completed(1, [1], heads=1)]}
+    with pytest.raises(RolloutError, match="a mapping of 2 tokens"):
+        read_completions(few, config, tiny.FNS)
+    with pytest.raises(RolloutError, match=r"choices of .* a list of completions"):
+        read_completions({"choices": [completed(0, [1], heads=2), 3]}, config, tiny.FNS)
