@@ -171,7 +171,7 @@ def test_devices_of_one_name_are_refused_at_once(tmp_path, command, press, capsy
     """Else the page shows the panels of one of them."""
     replay = ["replay", "--path", press]
     assert run(*command.split(), *replay, "+", *replay) == 1
-    assert "devices are ['tac3d', 'tac3d']: each name once; name them apart" in capsys.readouterr().err
+    assert "devices are ['tac3d', 'tac3d']: each name once; name cameras apart" in capsys.readouterr().err
 
 
 def test_a_recording_of_a_sensor_whose_delay_nobody_measured_is_refused(tmp_path, press, capsys):
