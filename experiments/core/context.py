@@ -114,9 +114,8 @@ class Context:
     def ended(self, stage: str) -> None:
         """Keep the number and the checksum of the lines of a stage that has ended, for `require_log`."""
         if self._log is not None:
-            write_sealed(
-                self._stage_file(f"{_LOGGED}/{stage}"), {"lines": summary(self._log.by_stage().get(stage, []))}
-            )
+            lines = self._log.by_stage().get(stage, [])
+            write_sealed(self._stage_file(f"{_LOGGED}/{stage}"), {"lines": summary(lines)})
 
     def require_log(self) -> None:
         """`DamagedFileError` unless the log has the lines of all stages that have ended; no other look may be taken."""

@@ -102,14 +102,15 @@ class Record(Bench):
             raise DeviceNotFoundError(
                 f"contact_mm is {self.contact_mm}: no RGB-D camera is named to see it; add + rgbd …, or leave it out"
             )
-        config = self.session()
+        offsets = None if self.sync is None else Offsets.load(self.sync)
+        config = self.session(offsets)
         _warn_of_little_disk(self.out)
         with contextlib.ExitStack() as stack:
             stop = stack.enter_context(stop_on_interrupt())
             tactile = stack.enter_context(readers(parts.tactile))
             force = stack.enter_context(readers((parts.force,) if parts.force else ()))
-            if self.sync is not None:
-                Offsets.load(self.sync).require([device.identity.sensor for device in (*tactile, *force)], self.sync)
+            if offsets is not None:
+                offsets.require([device.identity.sensor for device in (*tactile, *force)], self.sync)
             view = None if parts.view is None else self.look(parts.view)
             board = _Board()
             show = stack.enter_context(board.shown())
@@ -132,7 +133,7 @@ class Record(Bench):
             )
         return 0
 
-    def session(self) -> SessionConfig:
+    def session(self, offsets: Offsets | None) -> SessionConfig:
         """Configuration of the recording, with everything that was measured beforehand."""
         zero = None if self.gravity is None else ForceZero.load(self.gravity)
         given: dict[str, Any] = {} if zero is None else {"gravity": zero.model, "down": zero.down}
@@ -143,7 +144,7 @@ class Record(Bench):
             free_s=self.free_s,
             coach=self.coach,
             mount=self.mount.mount(),
-            late_s={} if self.sync is None else Offsets.load(self.sync).late_s,
+            late_s={} if offsets is None else offsets.late_s,
             **given,
         )
 

@@ -136,11 +136,11 @@ class Tracker:
         self._check(picture)
         picture = self._exposed_alike(picture)
         if apart:
-            self._last = self._start
+            self._last, gap = self._start, True
         points, found = self._forth(picture, self._last)
-        reseeded = gap or apart or self._failed(points, found)
+        reseeded = gap or self._failed(points, found)
         if reseeded:
-            points, found = self._recovered(picture, points, found, gap or apart)
+            points, found = self._recovered(picture, points, found, gap)
         points, found = self._gated(picture, points, found)
         self._last = self._completed(points, found)
         return Tracked(points_px=self._last, found=found, reseeded=reseeded)

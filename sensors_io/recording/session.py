@@ -199,11 +199,10 @@ class _Session:
                     journal.append("phase", {"time_ns": int(at), "phase": int(phase)})
             self._take(looked, advice, journal)
             if len(times) and not coach.begun:
-                now = int(times[-1]), phase, journal.size
-                waiting = waiting or now
-                if now[0] - waiting[0] > _UNTOUCHED_S * NS_PER_S:
+                if waiting is not None and times[-1] - waiting[0] > _UNTOUCHED_S * NS_PER_S:
                     _forget_before(waiting, journal, begin)
-                    waiting = (now[0], phase, journal.size)
+                    waiting = None
+                waiting = waiting or (int(times[-1]), phase, journal.size)
             if advice is not None:
                 self._show(self._status(stage, advice))
                 if advice.done:
