@@ -12,12 +12,12 @@ from experiments.study.controls import against_control, control_sentences, decis
 from experiments.study.estimates import change, changes, compare_over_objects, compare_over_seeds
 from experiments.study.examples import rollout_examples
 from experiments.study.levels import level_report
-from experiments.study.scores import Scored, score_study, study_results, study_settings
+from experiments.study.scores import Scored, preset_name, score_study, study_results, study_settings
 from experiments.study.stages import Weights
 from experiments.study.study import BLIND, SFT, SMOKE, EvalVariant, Study, StudyConfig, run_study
 from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.metrics import ORDINAL
-from touchr1_jax.rl.config import AnyAlgorithm, preset_name
+from touchr1_jax.rl.config import AnyAlgorithm
 from touchr1_jax.training.evaluation import Evaluation, rewards_of
 from touchr1_jax.training.loop import HELD_OUT
 

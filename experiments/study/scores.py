@@ -1,6 +1,7 @@
 """Scores of a study's answers: every policy and every baseline, with intervals over objects."""
 
 import dataclasses
+import enum
 import itertools
 from collections.abc import Mapping
 from typing import Any
@@ -17,7 +18,7 @@ from experiments.study.training import TrainingConfig
 from sensors_io.schema import ATTRIBUTES, LEVELS
 from touchr1_jax.bench.metrics import ORDINAL, Answers, Scores, evaluate
 from touchr1_jax.models.touch_policy import TouchPolicy
-from touchr1_jax.rl.config import preset_name
+from touchr1_jax.rl.config import Algorithm, GRPOConfig
 from touchr1_jax.training.evaluation import Evaluation, rewards_of
 from touchr1_jax.training.linear_probe import ProbeConfig, probe_log_probs
 from touchr1_jax.types import Parsed
@@ -172,3 +173,15 @@ def study_settings(config: TrainingConfig) -> dict[str, str | float]:
         "lr_scale": config.grpo.lr_scale,
         "sft_lr_scale": config.sft.optimizer.lr_scale,
     }
+
+
+def preset_name(config: GRPOConfig) -> str:
+    """Name of the algorithm's preset, and what differs from it and from the default sizes, as reports print it."""
+    algorithm, preset = config.algorithm, type(config.algorithm)()
+    names = [f.name for f in dataclasses.fields(Algorithm)]
+    word = lambda value: value.value if isinstance(value, enum.Enum) else value
+    changes = [f"{f}={word(getattr(algorithm, f))}" for f in names if getattr(algorithm, f) != getattr(preset, f)]
+    default = GRPOConfig(algorithm=algorithm)
+    names = [f.name for f in dataclasses.fields(GRPOConfig) if f.name != "algorithm"]
+    changes += [f"{f}={getattr(config, f)}" for f in names if getattr(config, f) != getattr(default, f)]
+    return " ".join([type(algorithm).__name__.lower(), *([f"with {', '.join(changes)}"] if changes else [])])

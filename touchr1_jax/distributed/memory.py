@@ -17,7 +17,7 @@ from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.distributed.rules import state_shardings
 from touchr1_jax.models.layers import MOST_SCORES
 from touchr1_jax.models.lm import DecoderConfig
-from touchr1_jax.rl.config import GRPOConfig, left_out
+from touchr1_jax.rl.config import GRPOConfig, left_out, needs_reference
 from touchr1_jax.rl.grpo import FrozenInputs, GRPOState
 from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.types import Params
@@ -224,4 +224,4 @@ def _sampler_bytes(shape: GRPOShape, params: Params) -> int:
 
 def _policies(shape: GRPOShape) -> int:
     """The learner, the reference and the perturbed policy, as far as their terms count."""
-    return 1 + (not left_out(shape.grpo.algorithm.beta)) + (not left_out(shape.grpo.algorithm.gamma))
+    return 1 + needs_reference(shape.grpo.algorithm) + (not left_out(shape.grpo.algorithm.gamma))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from touchr1_jax.distributed.memory import FLOAT, HALF, GRPOShape, head_weights, layer_weights
 from touchr1_jax.distributed.mesh import MeshConfig
-from touchr1_jax.rl.config import left_out
+from touchr1_jax.rl.config import left_out, needs_reference
 
 FORWARD, BACKWARD = 2, 4
 """Operations of a weight and token: a product and a sum; the gradients of the input and of the weight take two such."""
@@ -128,7 +128,7 @@ def _learning(shape: GRPOShape) -> Work:
 def _branches(shape: GRPOShape) -> tuple[int, int]:
     """Policies with a backward pass, and without one."""
     algorithm = shape.grpo.algorithm
-    perturbed, reference = not left_out(algorithm.gamma), not left_out(algorithm.beta)
+    perturbed, reference = not left_out(algorithm.gamma), needs_reference(algorithm)
     learns = perturbed and not algorithm.grounding_stop_masked
     return 1 + learns, reference + perturbed - learns
 

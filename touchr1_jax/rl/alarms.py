@@ -200,7 +200,7 @@ def gamed_answers(now: Metrics, start: Metrics) -> float | None:
 
 
 def sampler_mismatch(now: Metrics, start: Metrics) -> float | None:
-    """F16: mean |log π_learner − log π_sampler| of a token, nat."""
+    """F16: mean |log π_learner − log π_sampler| of a token, nat; of a sampler that lags, its lag is part of it."""
     del start
     return now.get("sampler_gap")
 

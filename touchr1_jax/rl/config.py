@@ -113,7 +113,10 @@ class Algorithm:
     """Weight of the KL to the reference."""
     kl: KLEstimator = "k3"
     kl_in_reward: bool = False
-    """Subtract β Σ_t log(π/π_ref), whatever `kl` is, from a reward, not β KL from J; as in verl, σ divides it too."""
+    """Subtract β Σ_t log(π/π_ref), whatever `kl` is, from a reward, not β KL from J; as in verl, σ divides it too.
+
+    Under top-p or min-p, each of the two is normalised over the tokens that it would draw from, and the drawn one.
+    """
     reference_every: int | None = None
     """Steps after which the policy becomes its own reference; `None` keeps the first reference."""
     reference_share: float = 1.0
@@ -176,6 +179,7 @@ class Algorithm:
         idle = {"learn_conclusion": "enumerated", "importance_sequence": "importance_cap", "kl_in_reward": "beta"}
         idle |= {"grounding_cap_nat": "gamma", "grounding_budget": "gamma", "entropy_floor_nat": "entropy_weight"}
         idle |= {"tactile_margin": "tactile_use", "reference_share": "reference_every"}
+        idle |= {"grounding_stop_masked": "gamma"} | ({"reference_every": "beta"} if self.learn_conclusion else {})
         for field, needed in idle.items():
             value, need = getattr(self, field), getattr(self, needed)
             if left_out(need) and value not in (None, getattr(type(self), field)):
@@ -193,6 +197,11 @@ def ratio_to_learner(algorithm: Algorithm) -> bool:
 def loss_beta(algorithm: Algorithm) -> float:
     """β of the KL in the loss; none where the KL is in the reward."""
     return 0.0 if algorithm.kl_in_reward else algorithm.beta
+
+
+def needs_reference(algorithm: Algorithm) -> bool:
+    """True if a step runs the reference: for its KL, or for conclusions that follow it."""
+    return not (left_out(algorithm.beta) and algorithm.learn_conclusion)
 
 
 def left_out(weight: Any) -> bool:
@@ -364,6 +373,9 @@ class GRPOConfig:
                 f"best_of is {best_of}: must be at most group {self.group}, and 1 for advantage PER_REWARD and for "
                 "segment_credit, which have no total to take the best of; lower it"
             )
+        cuts = f"top_p is {self.top_p}, min_p {self.min_p}"
+        if self.algorithm.enumerated is not None and (self.top_p, self.min_p) != (1, 0):
+            raise ValueError(f"{cuts}: must be 1 and 0 where enumerated is set: levels are not drawn; change either")
         if list(self.buckets) != sorted({n for n in self.buckets if 2 <= n < self.length}):
             raise ValueError(f"buckets is {self.buckets}: must ascend within 2 … {self.length - 1}; sort it")
 
@@ -386,15 +398,3 @@ class GRPOConfig:
 def at_precision(config: GRPOConfig, params: Params) -> Params:
     """The parameters in the type that forward passes compute in."""
     return jax.tree.map(lambda x: x.astype(jnp.bfloat16), params) if config.bfloat16 else params
-
-
-def preset_name(config: GRPOConfig) -> str:
-    """Name of the algorithm's preset, and what differs from it and from the default sizes, as reports print it."""
-    algorithm, preset = config.algorithm, type(config.algorithm)()
-    names = [f.name for f in dataclasses.fields(Algorithm)]
-    word = lambda value: value.value if isinstance(value, enum.Enum) else value
-    changes = [f"{f}={word(getattr(algorithm, f))}" for f in names if getattr(algorithm, f) != getattr(preset, f)]
-    default = GRPOConfig(algorithm=algorithm)
-    names = [f.name for f in dataclasses.fields(GRPOConfig) if f.name != "algorithm"]
-    changes += [f"{f}={getattr(config, f)}" for f in names if getattr(config, f) != getattr(default, f)]
-    return " ".join([type(algorithm).__name__.lower(), *([f"with {', '.join(changes)}"] if changes else [])])

@@ -19,7 +19,7 @@ from touchr1_jax.models.chunked_logits import Rows, by_blocks
 from touchr1_jax.models.lm import PrefixCache
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.policy_fns import PolicyFns
-from touchr1_jax.rl.config import GRPOConfig, at_precision, left_out, loss_beta, ratio_to_learner
+from touchr1_jax.rl.config import GRPOConfig, Paper, at_precision, left_out, loss_beta, ratio_to_learner
 from touchr1_jax.rl.enumerated import LevelRewards
 from touchr1_jax.rl.losses import TokenTerms, divisor, grpo_loss, token_log_probs, token_terms
 from touchr1_jax.rl.rollout import GRPOBatch, drawn_log_probs, tempered, truncates
@@ -133,11 +133,7 @@ def log_probs(
     fns: PolicyFns, config: GRPOConfig, params: Params, batch: GRPOBatch, rollout: Rollout
 ) -> Float[Array, "P G T"]:
     """Log-probabilities of the sampled tokens under some parameters."""
-    nothing: dict[str, Any] = dict.fromkeys(("beta", "gamma", "entropy_weight", "anchor"), 0.0)
-    nothing |= dict.fromkeys(("grounding_cap_nat", "grounding_budget", "entropy_floor_nat"))
-    nothing |= {"kl_in_reward": False, "learn_conclusion": True}
-    algorithm = dataclasses.replace(config.algorithm, **nothing)
-    plain = dataclasses.replace(config, algorithm=algorithm)
+    plain = dataclasses.replace(config, algorithm=Paper(beta=0.0, gamma=0.0, advantage=config.algorithm.advantage))
     each = jnp.ones(rollout.mask.shape[:2])
     stream = jnp.zeros(len(each), jnp.int32)
     learn = Experience(batch, batch.features.touch, stream, rollout, rollout.log_prob, each, each[:, 0])

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.study.scores import PUBLISHED
+from experiments.study.scores import PUBLISHED, preset_name
 from experiments.study.seed import StudySeed
 from experiments.study.stages import ProbeFeatures, StudySFT, answer_feed, gather_evidence, make_arm
 from experiments.study.study import make_study_arm
@@ -17,7 +17,7 @@ from sensors_io.schema import LEVELS
 from tests.experiments import tiny
 from touchr1_jax.models.lora import LoraConfig, by_layer
 from touchr1_jax.models.touch_policy import with_lora
-from touchr1_jax.rl.config import GRPOConfig
+from touchr1_jax.rl.config import DrGrpo, GRPOConfig, Stable, TactileUse
 from touchr1_jax.training.checkpoint import Checkpoints
 from touchr1_jax.training.feeds import AnswerFeed, encoded_clips
 from touchr1_jax.training.linear_probe import ProbeConfig
@@ -195,3 +195,11 @@ def test_one_word_chooses_the_stable_engine_and_the_stable_rewards(policy, data)
     stable = make_arm(policy, PUBLISHED, data.prior(), GRPOConfig.stable(), loop)
     assert paper.weights == PUBLISHED
     assert stable.weights == {"accuracy_strict": 0.6, "consistency_strict": 0.3, "format_strict": 0.1}
+
+
+def test_reports_name_the_preset_and_what_differs():
+    assert preset_name(GRPOConfig.paper()) == "paper"
+    assert preset_name(GRPOConfig.stable()) == "stable"
+    changed = GRPOConfig(algorithm=Stable(gamma=0.0, tactile_use=TactileUse.OFF), prompts=4)
+    assert preset_name(changed) == "stable with gamma=0.0, tactile_use=off, prompts=4"
+    assert preset_name(GRPOConfig(algorithm=DrGrpo())) == "drgrpo"

@@ -9,7 +9,7 @@ from touchr1_jax.distributed.memory import GRPOShape, head_weights, layer_weight
 from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.distributed.work import Machine, Work, grpo_work, model_flops, phase_seconds, seconds
 from touchr1_jax.models.qwen.config import released
-from touchr1_jax.rl.config import Paper
+from touchr1_jax.rl.config import Norm, Paper
 
 ALONE = MeshConfig()
 ONE = dataclasses.replace(DECODER, num_layers=1)
@@ -48,6 +48,8 @@ def test_without_divergences_learning_is_three_passes():
     judged = grpo_work(shape(algorithm=Paper(gamma=0.0)))["learning"].flops
     both = grpo_work(shape(algorithm=Paper()))["learning"].flops
     assert (judged, both) == (pytest.approx(4 * forward), pytest.approx(7 * forward))
+    followed = shape(algorithm=Paper(enumerated=Norm.NONE, learn_conclusion=False, beta=0.0, gamma=0.0))
+    assert grpo_work(followed)["learning"].flops == judged, "conclusions that follow the reference need it"
 
 
 @pytest.mark.parametrize("mesh", [MeshConfig(fsdp=8), MeshConfig(data=2, tensor=2), MeshConfig(fsdp=4, tensor=2)])

@@ -15,13 +15,13 @@ from touchr1_jax.rl.config import (
     DrGrpo,
     GRPOConfig,
     Gspo,
+    Norm,
     Paper,
     ReinforcePlusPlus,
     Rloo,
     Stable,
     Surrogate,
     TactileUse,
-    preset_name,
 )
 
 
@@ -82,6 +82,12 @@ def test_a_group_of_one_has_nothing_to_be_compared_with():
     assert GRPOConfig(group=1, algorithm=ReinforcePlusPlus()).group == 1
 
 
+def test_an_enumerated_level_is_not_drawn_from_a_nucleus():
+    with pytest.raises(ValueError, match=r"top_p is 0.9, min_p 0.0: must be 1 and 0 where enumerated is set"):
+        GRPOConfig(top_p=0.9, algorithm=Paper(enumerated=Norm.NONE))
+    assert Paper(enumerated=Norm.NONE, learn_conclusion=False, beta=0.0, reference_every=3).reference_every == 3
+
+
 def test_segments_are_credited_only_where_a_token_has_a_credit_of_its_own():
     """The best of k rewards is none of their sums; one ratio for all tokens gives each the mean of their credits."""
     with pytest.raises(ValueError, match=r"best_of is 2: must be .* 1 for .* segment_credit"):
@@ -106,14 +112,6 @@ def test_segments_are_credited_only_where_a_token_has_a_credit_of_its_own():
 def test_bad_settings_are_named(change, message):
     with pytest.raises(ValueError, match=message):
         Paper(**change)
-
-
-def test_reports_name_the_preset_and_what_differs():
-    assert preset_name(GRPOConfig.paper()) == "paper"
-    assert preset_name(GRPOConfig.stable()) == "stable"
-    changed = GRPOConfig(algorithm=Stable(gamma=0.0, tactile_use=TactileUse.OFF), prompts=4)
-    assert preset_name(changed) == "stable with gamma=0.0, tactile_use=off, prompts=4"
-    assert preset_name(GRPOConfig(algorithm=DrGrpo())) == "drgrpo"
 
 
 def test_the_command_line_chooses_a_preset_and_changes_it():
