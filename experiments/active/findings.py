@@ -26,6 +26,7 @@ from experiments.core.text import bounds, number
 from experiments.study.estimates import compare_over_objects, compare_over_seeds, estimate
 from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.bench.statistics import Interval
+from touchr1_jax.rl.config import preset_name
 from touchr1_jax.training.exploration import NO_CHOICE
 
 METRIC = "acc"  # mean of the accuracy over the five properties
@@ -70,7 +71,7 @@ def findings(
             *([report.trajectory_picture(touched)] if touched else []),
         ),
         settings={
-            "preset": type(learner.grpo.algorithm).__name__.lower(),
+            "preset": preset_name(learner.grpo),
             "lr_scale": learner.grpo.lr_scale,
             "choices": f"{len(setup.choices)}: {len(setup.sensors)} sensors, {len(setup.motions)} motions, "
             f"{len(setup.forces_n)} forces",

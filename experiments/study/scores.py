@@ -17,7 +17,7 @@ from experiments.study.training import TrainingConfig
 from sensors_io.schema import ATTRIBUTES, LEVELS
 from touchr1_jax.bench.metrics import ORDINAL, Answers, Scores, evaluate
 from touchr1_jax.models.touch_policy import TouchPolicy
-from touchr1_jax.rl.config import preset_name
+from touchr1_jax.rl.config import AnyAlgorithm, preset_name
 from touchr1_jax.training.evaluation import Evaluation, rewards_of
 from touchr1_jax.training.linear_probe import ProbeConfig, probe_log_probs
 from touchr1_jax.types import Parsed
@@ -164,11 +164,16 @@ def study_results(study: Study, scored: Scored, **further: Any) -> Results:
     return Results(**(made | further))
 
 
+def trained_preset(config: TrainingConfig, algorithm: AnyAlgorithm) -> str:
+    """Name of the preset by which an arm of an algorithm trains, with the anchor under recipe `touch`."""
+    return preset_name(dataclasses.replace(config.grpo, algorithm=config.algorithm(algorithm)))
+
+
 def study_settings(config: TrainingConfig) -> dict[str, str | float]:
     """The recipe of training, the preset of the engine, and the factors on the paper's learning rates."""
     return {
         "recipe": config.recipe,
-        "preset": preset_name(config.grpo),
+        "preset": trained_preset(config, config.grpo.algorithm),
         "lr_scale": config.grpo.lr_scale,
         "sft_lr_scale": config.sft.optimizer.lr_scale,
     }
