@@ -24,6 +24,7 @@ from experiments.core.results import (
 )
 from experiments.core.text import bounds, number
 from experiments.study.estimates import compare_over_objects, compare_over_seeds, estimate
+from experiments.study.training import preset_name
 from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.bench.statistics import Interval
 from touchr1_jax.training.exploration import NO_CHOICE
@@ -70,7 +71,7 @@ def findings(
             *([report.trajectory_picture(touched)] if touched else []),
         ),
         settings={
-            "preset": type(learner.grpo.algorithm).__name__.lower(),
+            "preset": preset_name(learner.grpo),
             "lr_scale": learner.grpo.lr_scale,
             "choices": f"{len(setup.choices)}: {len(setup.sensors)} sensors, {len(setup.motions)} motions, "
             f"{len(setup.forces_n)} forces",

@@ -33,6 +33,7 @@ from experiments.core.metric_log import read_metrics
 from experiments.core.results import Requirement, Results, Table, at_least, named_table
 from experiments.core.runner import Experiment
 from experiments.study.alarm_log import ALARM
+from experiments.study.training import preset_name
 from touchr1_jax.models.active_policy import ActivePolicy
 from touchr1_jax.training.exploration import NO_CHOICE
 
@@ -90,7 +91,7 @@ def run(config: StabilityTouchConfig, context: Context) -> Results:
         settings={
             "choices": len(world.bank.choices),
             "objects": ", ".join(f"{name} {len(rows)}" for name, rows in world.parts.items()),
-            "preset": type(config.learner.grpo.algorithm).__name__.lower(),
+            "preset": preset_name(config.learner.grpo),
         },
     )
 

@@ -40,6 +40,7 @@ from experiments.study.controls import control_sentences
 from experiments.study.seed import TrainedPolicy
 from experiments.study.stages import untrained
 from experiments.study.study import SFT, EvalVariant, StudyConfig
+from experiments.study.training import Recipe
 from touchr1_jax.training.evaluation import Evaluation
 
 UNTRAINED = "untrained"
@@ -98,7 +99,7 @@ def run(config: StudyConfig, context: Context) -> Results:
         tables=(
             ladder_table(found.estimates),
             effects,
-            attribute_table(found.estimates),
+            attribute_table(found.estimates, config.recipe),
             *pooled_table(results.arms, SFT),
             *further,
             paper.differences_table(presets.DIFFERENCES),
@@ -124,7 +125,13 @@ def ladder_table(estimates: Mapping[str, Mapping[str, Estimate]]) -> Table:
     )
 
 
-def attribute_table(estimates: Mapping[str, Mapping[str, Estimate]]) -> Table:
+ASKED: Mapping[Recipe, str] = {
+    "touch": "GRPO asks about all four.",
+    "paper": "GRPO asks about hardness, roughness and protrusion; material is asked in the evaluation alone.",
+}
+
+
+def attribute_table(estimates: Mapping[str, Mapping[str, Estimate]], recipe: Recipe) -> Table:
     """Accuracy on each attribute of every arm of the ladder, and of the paper's table (b)."""
     rows: list[dict[str, Cell]] = []
     for arm, published, _ in ROWS:
@@ -139,7 +146,7 @@ def attribute_table(estimates: Mapping[str, Mapping[str, Estimate]]) -> Table:
         rows,
         formats={f"{title}, paper": ".1f" for title in PER_ATTRIBUTE.values()},
         units={column: "%" for title in PER_ATTRIBUTE.values() for column in (title, f"{title}, paper")},
-        note="GRPO asks about hardness, roughness and protrusion; material is asked in the evaluation alone.",
+        note=ASKED[recipe],
     )
 
 

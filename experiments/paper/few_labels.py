@@ -353,7 +353,8 @@ def curve_table(
         formats={"OMAE": ".3f", "material": ".1f"},
         units={"accuracy": "%", "OMAE": "levels", "material": "%", "gain": "points"},
         meanings={"gain": "accuracy minus that of the policy that training starts from, 95 % over objects"},
-        note="sft is end to end; GRPO, agreement and physics start from two_phases.",
+        note="sft is end to end; GRPO, agreement and physics start from two_phases, which is the best of its decoder's "
+        "checkpoints on all validation objects, labels that are in no count. All others are their last checkpoint.",
     )
 
 

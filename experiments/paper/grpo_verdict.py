@@ -7,7 +7,7 @@ contacts and on all properties; half of the questions use only some of the senso
 likelihood of the verified answers (anchor).  Arms differ in the conclusion (sampled, or enumerated with its exact
 gradient), the prompts of a step (8 or 64) and the algorithm (DAPO, GSPO, CISPO, leave-one-out).  The control continues
 SFT of the decoder for as many seconds.  The learning rate of each arm is chosen on validation objects, with the first
-seed.  All policies are scored once, on objects of another scene seed.
+seed.  All policies are scored once, after their last step, on objects of another scene seed.
 
 Cost: some 80 minutes of one core, a third of it compiling; `--scale smoke` under two minutes.
 
@@ -30,7 +30,7 @@ from experiments.core.text import bounds, interval, number
 from experiments.study.answers import answers_path, load_answers, save_answers, share_right
 from experiments.study.dataset import Dataset
 from experiments.study.estimates import SeedScores, compare_rows, estimate_rows
-from experiments.study.scores import score, study_settings
+from experiments.study.scores import score, study_settings, trained_preset
 from experiments.study.seed import StudySeed, Validation, supervised
 from experiments.study.stages import (
     EncodedContacts,
@@ -47,7 +47,7 @@ from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.touch_policy import TouchPolicy, build_policy, check_model, with_lora
-from touchr1_jax.rl.config import AnyAlgorithm, Cispo, Dapo, GRPOConfig, Gspo, Norm, Rloo
+from touchr1_jax.rl.config import AnyAlgorithm, Cispo, Dapo, GRPOConfig, Gspo, Norm, Paper, Rloo
 from touchr1_jax.training.evaluation import Evaluation, evaluate_policy
 from touchr1_jax.training.loop import LoopConfig
 from touchr1_jax.types import Params
@@ -190,7 +190,7 @@ def train_policy(
         return reinforced(started, name, rates[name], arms[name][rates[name]])
     config = started.config
     longer = dataclasses.replace(config.continued, steps=config.continued_steps)
-    return started.continued(longer, started.train, started.held_out, started.params)
+    return started.continued(longer, started.train, None, started.params)  # its last checkpoint, as of the arms
 
 
 def asked(started: StartedSeed, name: str, train: Any, label: np.ndarray) -> Evaluation:
@@ -219,9 +219,18 @@ def report(
         arms=rows,
         comparisons=tuple(comparisons),
         tables=(verdict_table(config, context, rows, comparisons, rates, objects),),
-        settings={**study_settings(config), "rewards": ", ".join(f"{n} {w:g}" for n, w in REWARDS.items())},
+        settings=study_settings(config)
+        | trained_by(config)
+        | {"rewards": ", ".join(f"{n} {w:g}" for n, w in REWARDS.items())},
         data=fresh.summary(),
     )
+
+
+def trained_by(config: GrpoVerdictConfig) -> dict[str, str]:
+    """Presets of the arms with what they share, and the rates of which validation objects choose."""
+    changes = trained_preset(config, Paper()).partition(" with ")[1:]
+    rates = " or ".join(f"{rate:g}" for rate in config.lr_scales)
+    return {"preset": "".join((", ".join(config.presets), *changes)), "lr_scale": rates}
 
 
 def sure(comparisons: Sequence[Comparison], arm: str, metric: str) -> int:

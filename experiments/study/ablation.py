@@ -12,7 +12,7 @@ from experiments.study.controls import against_control, control_sentences, decis
 from experiments.study.estimates import change, changes, compare_over_objects, compare_over_seeds
 from experiments.study.examples import rollout_examples
 from experiments.study.levels import level_report
-from experiments.study.scores import Scored, preset_name, score_study, study_results, study_settings
+from experiments.study.scores import Scored, score_study, study_results, study_settings, trained_preset
 from experiments.study.stages import Weights
 from experiments.study.study import BLIND, SFT, SMOKE, EvalVariant, Study, StudyConfig, run_study
 from sensors_io.schema import ATTRIBUTES
@@ -86,7 +86,7 @@ def run_ablation(ablation: Ablation, config: StudyConfig, context: Context) -> t
     shown = ablation.example or list(ablation.arms)[-1]
     pictures, tables = level_report(study)
     presets = {
-        f"preset of {arm}": preset_name(dataclasses.replace(config.grpo, algorithm=algorithm))
+        f"preset of {arm}": trained_preset(config, algorithm)
         for arm, algorithm in ablation.algorithms.items()
         if algorithm != config.grpo.algorithm
     }

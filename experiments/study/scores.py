@@ -1,7 +1,6 @@
 """Scores of a study's answers: every policy and every baseline, with intervals over objects."""
 
 import dataclasses
-import enum
 import itertools
 from collections.abc import Mapping
 from typing import Any
@@ -14,11 +13,11 @@ from experiments.study.dataset import Dataset
 from experiments.study.estimates import estimate_rows
 from experiments.study.stages import ProbeFeatures, Weights
 from experiments.study.study import SFT, Study
-from experiments.study.training import TrainingConfig
+from experiments.study.training import TrainingConfig, preset_name
 from sensors_io.schema import ATTRIBUTES, LEVELS
 from touchr1_jax.bench.metrics import ORDINAL, Answers, Scores, evaluate
 from touchr1_jax.models.touch_policy import TouchPolicy
-from touchr1_jax.rl.config import Algorithm, GRPOConfig
+from touchr1_jax.rl.config import AnyAlgorithm
 from touchr1_jax.training.evaluation import Evaluation, rewards_of
 from touchr1_jax.training.linear_probe import ProbeConfig, probe_log_probs
 from touchr1_jax.types import Parsed
@@ -165,23 +164,16 @@ def study_results(study: Study, scored: Scored, **further: Any) -> Results:
     return Results(**(made | further))
 
 
+def trained_preset(config: TrainingConfig, algorithm: AnyAlgorithm) -> str:
+    """Name of the preset by which an arm of an algorithm trains, with the anchor under recipe `touch`."""
+    return preset_name(dataclasses.replace(config.grpo, algorithm=config.algorithm(algorithm)))
+
+
 def study_settings(config: TrainingConfig) -> dict[str, str | float]:
     """The recipe of training, the preset of the engine, and the factors on the paper's learning rates."""
     return {
         "recipe": config.recipe,
-        "preset": preset_name(config.grpo),
+        "preset": trained_preset(config, config.grpo.algorithm),
         "lr_scale": config.grpo.lr_scale,
         "sft_lr_scale": config.sft.optimizer.lr_scale,
     }
-
-
-def preset_name(config: GRPOConfig) -> str:
-    """Name of the algorithm's preset, and what differs from it and from the default sizes, as reports print it."""
-    algorithm, preset = config.algorithm, type(config.algorithm)()
-    names = [f.name for f in dataclasses.fields(Algorithm)]
-    word = lambda value: value.value if isinstance(value, enum.Enum) else value
-    changes = [f"{f}={word(getattr(algorithm, f))}" for f in names if getattr(algorithm, f) != getattr(preset, f)]
-    default = GRPOConfig(algorithm=algorithm)
-    names = [f.name for f in dataclasses.fields(GRPOConfig) if f.name != "algorithm"]
-    changes += [f"{f}={getattr(config, f)}" for f in names if getattr(config, f) != getattr(default, f)]
-    return " ".join([type(algorithm).__name__.lower(), *([f"with {', '.join(changes)}"] if changes else [])])

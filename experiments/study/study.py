@@ -32,7 +32,7 @@ from experiments.study.stages import (
     make_arm,
     probe_features,
 )
-from experiments.study.training import DECODER, TrainingConfig, open_data, require_derived, starting_model
+from experiments.study.training import DECODER, TrainingConfig, open_data, preset_name, require_derived, starting_model
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS
 from sensors_io.units import WorkUnit, finish
@@ -41,7 +41,7 @@ from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import ModelConfig, TouchPolicy, build_policy, check_model, with_lora
 from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.rewards import AnyReward, RewardError, make_rewards, uniform_prior
-from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
+from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig, Paper
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.training.compilation import compilations_kept, compiled_quickly
 from touchr1_jax.training.evaluation import Evaluation
@@ -120,8 +120,12 @@ def run_study(
       variants: further evaluations of SFT, the control and the arms, by the names of their answers.
 
     Raises:
+      ValueError: an algorithm is configured and all arms have their own.
       ValueError, RewardError, SizeError, EncoderError: as `check_arms`, `check_model` and `load_encoder`.
     """
+    if arms.keys() <= algorithms.keys() and config.grpo.algorithm != Paper():
+        given = preset_name(GRPOConfig(algorithm=config.grpo.algorithm))
+        raise ValueError(f"grpo.algorithm is {given}: no arm trains by it, for each has its own; leave it out")
     check_arms({arm: {**weights, **config.more_rewards} for arm, weights in arms.items()}, variants)
     check_model(config.model, SENSORS)
     if config.encoder is not None:

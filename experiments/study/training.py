@@ -1,6 +1,7 @@
 """Settings of every study, whichever model it trains: data, stages, seeds."""
 
 import dataclasses
+import enum
 import math
 from pathlib import Path
 from typing import Literal, TypeVar
@@ -21,7 +22,7 @@ from touchr1_jax.distributed.processes import GIB
 from touchr1_jax.models.lora import LoraConfig
 from touchr1_jax.models.pretrained import load_encoder
 from touchr1_jax.models.touch_policy import TouchConfig
-from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
+from touchr1_jax.rl.config import Algorithm, AnyAlgorithm, GRPOConfig
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.training.linear_probe import ProbeConfig
 from touchr1_jax.training.loop import LoopConfig
@@ -202,3 +203,15 @@ def starting_model(model: M, encoder: Path | None, sensors: tuple[str, ...]) -> 
         return model, None
     pretrained = load_encoder(encoder).for_sensors(sensors)
     return dataclasses.replace(model, tactile=pretrained.config), pretrained.params
+
+
+def preset_name(config: GRPOConfig) -> str:
+    """Name of the algorithm's preset, and what differs from it and from the default sizes, as reports print it."""
+    algorithm, preset = config.algorithm, type(config.algorithm)()
+    names = [f.name for f in dataclasses.fields(Algorithm)]
+    word = lambda value: value.value if isinstance(value, enum.Enum) else value
+    changes = [f"{f}={word(getattr(algorithm, f))}" for f in names if getattr(algorithm, f) != getattr(preset, f)]
+    default = GRPOConfig(algorithm=algorithm)
+    names = [f.name for f in dataclasses.fields(GRPOConfig) if f.name != "algorithm"]
+    changes += [f"{f}={getattr(config, f)}" for f in names if getattr(config, f) != getattr(default, f)]
+    return " ".join([type(algorithm).__name__.lower(), *([f"with {', '.join(changes)}"] if changes else [])])

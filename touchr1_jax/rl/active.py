@@ -142,8 +142,9 @@ class ActiveEngine(GRPOEngine):
         reward, terms, finite, left_out = left_out_groups(reward, terms)
         levels = None
         if self.config.algorithm.enumerated is not None and self.levels is not None:
-            of = with_answer, self.levels, found.rollout.tokens, batch.target, reward, finite
-            levels, finite, more = level_rewards(*of)
+            follows = jnp.roll(found.rollout.mask, -1, -1)  # a trajectory may end by a tag that no turn has there
+            tokens = jnp.where(follows, found.rollout.tokens, self.fns.pad_id)
+            levels, finite, more = level_rewards(with_answer, self.levels, tokens, batch.target, reward, finite)
             left_out |= more
         seen = Explored(batch.features, found.touch, found.exists, jnp.any(found.exists, (1, 2, 3))[:, None])
         shown: dict[str, Any] = {"features": seen}

@@ -90,7 +90,7 @@ def advantages(
     """
     epsilon, reward = algorithm.epsilon, best_of(reward, algorithm.best_of)
     of_batch = epsilon if finite is None else epsilon * jnp.sqrt(jnp.mean(finite.astype(jnp.float32)))
-    if finite is not None and algorithm.best_of > 1:  # the best of k has another mean over the batch than the reward
+    if finite is not None:  # the best of k, and the groups selected of all candidates, have means of their own
         reward = neutralised(reward, finite)
     match algorithm.advantage:
         case Advantage.GROUP:

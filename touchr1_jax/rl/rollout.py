@@ -42,7 +42,7 @@ class GRPOBatch:
     """Verified answers, whose likelihood an anchor raises; `None` where there is no anchor."""
     answer_mask: Bool[Array, "P T"] | None = None
     rollout: Rollout | None = None
-    """Completions that another program drew, [P, G, T]; `None` lets the step draw them."""
+    """Completions that another program drew, [P, G, T], padding after their ends; `None` lets the step draw them."""
 
 
 class EncodedPrompts(NamedTuple):

@@ -1,10 +1,12 @@
 """Effects of components by hand values, agreement with the paper's signs, and the failures that a run shows."""
 
+import collections
 import dataclasses
 
 import numpy as np
 import pytest
 
+from experiments.paper.ablation_cumulative import attribute_table
 from experiments.paper.component_effects import (
     FOUR,
     LADDER_METRICS,
@@ -35,6 +37,13 @@ def rows(a, b):
 
 def effects(a, b, step=STEP):
     return component_effects([step], rows(a, b), OBJECTS)
+
+
+@pytest.mark.parametrize(("recipe", "asks"), [("touch", False), ("paper", True)])
+def test_the_table_of_attributes_says_what_grpo_asks_about(recipe, asks):
+    assert (
+        "material is asked in the evaluation alone" in attribute_table(collections.defaultdict(dict), recipe).note
+    ) == asks
 
 
 def test_an_effect_is_the_mean_difference_of_paired_seeds():

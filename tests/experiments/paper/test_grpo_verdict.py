@@ -1,11 +1,13 @@
 """Verdicts on reinforcement, on the lengths of SFT and on sizes, by hand values."""
 
+import types
+
 import numpy as np
 import pytest
 
 from experiments.core.results import Comparison, Estimate
 from experiments.paper.few_labels import verdict as curves_verdict
-from experiments.paper.grpo_verdict import algorithm_of, sure
+from experiments.paper.grpo_verdict import CONTINUED, GrpoVerdictConfig, algorithm_of, sure, train_policy, trained_by
 from experiments.paper.model_sizes import SizeCost, grpo_step_s, size_trends
 from experiments.paper.pareto_sft import PhaseResult, efficient
 from tests.experiments import tiny
@@ -47,6 +49,19 @@ def test_an_enumerated_preset_keeps_its_norm_and_draws_no_prompt_twice():
     assert (exact.enumerated, exact.candidates, exact.clip_high) == (Norm.STD, 1, 0.28)
     assert algorithm_of("rloo", exact=True).enumerated is Norm.NONE
     assert algorithm_of("rloo", exact=False).enumerated is None
+
+
+def test_the_report_names_the_algorithms_and_rates_of_the_arms():
+    of_arms = "dapo, gspo, cispo, rloo with anchor=1.0, group=4, micro_prompts=8, inverse_draws=True"
+    assert trained_by(GrpoVerdictConfig()) == {"preset": of_arms, "lr_scale": "100 or 400"}
+
+
+def test_the_control_ends_with_its_last_checkpoint_as_the_arms_do():
+    given = []
+    continued = lambda config, contacts, validation, params: given.append(validation)
+    started = types.SimpleNamespace(config=GrpoVerdictConfig(), train=0, held_out=1, params=2, continued=continued)
+    train_policy(started, CONTINUED, {}, {})
+    assert given == [None]
 
 
 def test_the_verdict_of_few_labels_names_where_a_step_pays_and_where_it_costs():

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.study.scores import PUBLISHED, preset_name
+from experiments.study.scores import PUBLISHED
 from experiments.study.seed import StudySeed
 from experiments.study.stages import ProbeFeatures, StudySFT, answer_feed, gather_evidence, make_arm
 from experiments.study.study import make_study_arm
-from experiments.study.training import TrainingConfig
+from experiments.study.training import TrainingConfig, preset_name
 from sensors_io.schema import LEVELS
 from tests.experiments import tiny
 from touchr1_jax.models.lora import LoraConfig, by_layer

@@ -16,14 +16,16 @@ from experiments.study.scores import (
     level_answers,
     score,
     score_study,
+    study_settings,
 )
 from experiments.study.stages import ProbeFeatures
-from experiments.study.study import CONTINUED, SFT, Study, check_arms
+from experiments.study.study import CONTINUED, SFT, Study, StudyConfig, check_arms, run_study
 from sensors_io.schema import SENSORS
 from tests.experiments import tiny
 from touchr1_jax.models.layers import SizeError
 from touchr1_jax.models.touch_policy import ModelConfig, check_model
 from touchr1_jax.rewards import Reward, RewardError
+from touchr1_jax.rl.config import GRPOConfig, Paper
 from touchr1_jax.training.evaluation import Evaluation
 from touchr1_jax.training.linear_probe import ProbeConfig
 from touchr1_jax.types import Parsed
@@ -173,6 +175,19 @@ def test_a_reward_that_does_not_fit_is_named_with_its_arm(reward, message):
         check_arms({"good": {"mine": 0.5}}, rewards={"mine": reward})
     with pytest.raises(RewardError, match=r"no reward is called 'brevty'; choose from accuracy.* of arm 'mine'"):
         check_arms({"published": PUBLISHED, "mine": {"brevty": 1.0}})
+
+
+def test_an_algorithm_that_no_arm_trains_by_is_refused():
+    with pytest.raises(ValueError, match=r"grpo\.algorithm is stable: .* each has its own; leave it out"):
+        run_study(StudyConfig(grpo=GRPOConfig.stable()), {"full": PUBLISHED}, None, {"full": Paper()})  # type: ignore[arg-type]
+
+
+def test_reports_name_the_algorithm_by_which_arms_train():
+    """Under recipe `touch`, with the likelihood of verified answers."""
+    config = StudyConfig()
+    published = dataclasses.replace(config, recipe="paper", sft=dataclasses.replace(config.sft, steps=1))
+    assert study_settings(config)["preset"] == "paper with anchor=1.0"
+    assert study_settings(published)["preset"] == "paper"
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from tests.touchr1_jax import explored
 from tests.touchr1_jax.explored import BANK, BUDGET, POLICY, SHALLOW, N, T
 from touchr1_jax.models.active_policy import Explored
 from touchr1_jax.models.policy import Policy
+from touchr1_jax.rl import active
 from touchr1_jax.rl.active import (
     ActiveEngine,
     ActiveInputs,
@@ -25,6 +26,7 @@ from touchr1_jax.rl.config import DrGrpo, GRPOConfig, Norm, Paper, Stable
 from touchr1_jax.rl.gradient import Experience, grpo_gradient
 from touchr1_jax.rl.grpo import start_state
 from touchr1_jax.rl.touch_reward import Prices, priced_answer
+from touchr1_jax.rl.trajectory import Trajectories, sample_trajectories
 from touchr1_jax.types import Rollout
 
 PRICES = Prices(jnp.float32(0.05), jnp.float32(0.1))
@@ -155,9 +157,20 @@ def test_one_program_serves_all_prices_and_batches():
     assert step._cache_size() == 1
 
 
+def one_malformed(*given) -> Trajectories:
+    """Drawn trajectories, of which the first names a conclusion where its touch should stand, and ends there."""
+    found = sample_trajectories(*given)
+    turn = jnp.asarray(POLICY.tokenizer.encode("<touch> <conclude>"))
+    tokens = found.rollout.tokens.at[0, 0].set(POLICY.tokenizer.pad_id).at[0, 0, : len(turn)].set(turn)
+    mask = found.rollout.mask.at[0, 0].set(jnp.arange(T) < len(turn))
+    parsed = found.parsed.replace(conclude=found.parsed.conclude.at[0, 0].set(-1))
+    return found.replace(rollout=found.rollout.replace(tokens=tokens, mask=mask), parsed=parsed)
+
+
 @pytest.mark.long
-def test_answers_are_enumerated_with_the_price_of_their_touches():
-    """Each level earns what a trajectory with that answer does."""
+def test_answers_are_enumerated_with_the_price_of_their_touches(monkeypatch):
+    """Each level earns what a trajectory with that answer does; one that ended without a conclusion states none."""
+    monkeypatch.setattr(active, "sample_trajectories", one_malformed)
     algorithm = Paper(constrained=True, gamma=0.0, beta=0.0, enumerated=Norm.NONE, learn_conclusion=False)
     config = dataclasses.replace(STEP, algorithm=algorithm)
     fns, optimizer, bank = SHALLOW.constrained_fns, optax.sgd(1e-3), jax.tree.map(jnp.asarray, BANK)
@@ -169,7 +182,9 @@ def test_answers_are_enumerated_with_the_price_of_their_touches():
     right = label[:, None, None] == np.arange(3)
     cost = group.terms["seconds"] + group.terms["harm"]
     np.testing.assert_allclose(group.levels.reward, right + cost[..., None], atol=1e-6)
-    word = np.take_along_axis(np.asarray(group.rollout.tokens), np.asarray(group.levels.at)[..., None], -1)[..., 0]
+    assert group.levels.at[0, 0] == T
+    last = np.minimum(group.levels.at, T - 1)
+    word = np.take_along_axis(np.asarray(group.rollout.tokens), last[..., None], -1)[..., 0]
     answered = (word[..., None] == np.asarray(group.levels.ids)[:, None]) @ np.arange(1, 4) - 1
     np.testing.assert_array_equal(answered, np.asarray(group.parsed.conclude)[np.arange(4), :, np.arange(4) % 2])
     assert 0 <= metrics["first_kind_information"] < np.log(2)
