@@ -210,9 +210,9 @@ def _said(card: ObjectCard) -> str:
 def _read(path: pathlib.Path, key: ContactKey, config: VideosConfig) -> Taken:
     if path.is_file():
         video = read_video(path, config)
-        gap, times = np.zeros(len(video.index), np.bool_), nominal_ns(video.index, video.rate_hz)
+        gap = np.zeros(len(video.index), np.bool_)
         camera = video.camera(path)
-        sequence = film(key, config.sensor, gap=gap, host_time_ns=times, camera=camera, frames=video.frames)
+        sequence = film(key, config.sensor, gap=gap, host_time_ns=video.time_ns, camera=camera, frames=video.frames)
         return Taken(sequences=(sequence,))
     paths = numbered(path)
     pictures = read_pictures(paths, config.positions(len(paths)), config)
