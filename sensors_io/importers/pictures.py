@@ -2,9 +2,10 @@
 
 import dataclasses
 import itertools
+import os
 import pathlib
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from collections.abc import Sequence as Seq
 from typing import Any
 
@@ -128,14 +129,23 @@ def numbered(folder: pathlib.Path, suffixes: tuple[str, ...] = (".jpg", ".jpeg",
     Raises:
       ImportSourceError: names such as 0.15.png and 0.2.png, whose order depends on what the point means.
     """
-    files = [f for f in folder.iterdir() if f.suffix.lower() in suffixes] if folder.is_dir() else []
-    return in_order(files)
+    files = list(folder.iterdir()) if folder.is_dir() else []
+    return in_order([f for f in files if f.suffix.lower() in suffixes and not f.name.startswith(".")])
+
+
+def inside(folder: pathlib.Path) -> Iterator[pathlib.Path]:
+    """All files and folders below a folder, also behind links, but for hidden ones: macOS writes ._a.png beside a.png."""
+    for place, folders, files in os.walk(folder, followlinks=True):
+        path, true = pathlib.Path(place), os.path.realpath(place)
+        above = {true, *map(str, pathlib.Path(true).parents)}  # a link back to one of them has no end
+        folders[:] = [f for f in folders if not f.startswith(".") and os.path.realpath(path / f) not in above]
+        yield from (path / name for name in (*folders, *files) if not name.startswith("."))
 
 
 def below(folder: pathlib.Path, suffixes: Collection[str]) -> list[pathlib.Path]:
     """Pictures of a folder and of those below it, folder by folder, as `numbered` orders them."""
     found: dict[pathlib.Path, list[pathlib.Path]] = {}
-    for path in folder.rglob("*"):
+    for path in inside(folder):
         if path.suffix.lower() in suffixes:
             found.setdefault(path.parent, []).append(path)
     folders = sorted(found, key=lambda path: [natural(part) for part in (*reversed(path.parents), path)])

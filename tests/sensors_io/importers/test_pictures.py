@@ -70,6 +70,19 @@ def test_names_are_ordered_by_their_numbers(tmp_path):
     (tmp_path / "a10" / "1.png").touch()
     names = [path.relative_to(tmp_path).as_posix() for path in below(tmp_path, {".png"})]
     assert names[2:] == ["frame_100.png", "a2/0.15.png", "a2/0.20.png", "a10/1.png"]
+
+
+def test_links_are_followed_and_hidden_names_are_left_alone(tmp_path):
+    """macOS writes ._1.png beside 1.png on the disks of others, and a disk keeps what was deleted in .Trashes."""
+    folder = tmp_path / "clips"
+    for name in ("1.png", "._1.png", ".Trashes/2.png", "mug/3.png"):
+        picture(folder / name)
+    (folder / "back").symlink_to(folder)
+    picture(tmp_path / "elsewhere" / "deep" / "4.png")
+    (folder / "linked").symlink_to(tmp_path / "elsewhere")
+    names = [path.relative_to(folder).as_posix() for path in below(folder, {".png"})]
+    assert names == ["1.png", "linked/deep/4.png", "mug/3.png"]
+    assert [path.name for path in numbered(folder)] == ["1.png"]
     refused(UnreadableError, "reach 3.33e\\+37, which 64 bits", nominal_ns, np.array([1, 10**30]), 30.0)
     assert natural(tmp_path / "a2b") < natural(tmp_path / "a10b")
     assert natural(tmp_path / "a٢b") < natural(tmp_path / "a10b") < natural(tmp_path / "a10²1")
