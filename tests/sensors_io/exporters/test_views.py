@@ -95,6 +95,15 @@ def test_a_rerun_recording_loads_and_has_its_entities(tmp_path, selected):
         assert f"/00001_object_0_press/{name}" in shown
 
 
+def test_a_phase_without_a_name_is_a_number_in_rerun(tmp_path):
+    pytest.importorskip("rerun")
+    with RecordWriter(tmp_path / "records", meta=fakes.META) as writer:
+        writer.write_object(fakes.card())
+        writer.write_contact([fakes.sequence(length=2, phase=np.array([0, 5], np.uint8))])
+    export_rerun(Selected(store=RecordStore(tmp_path / "records")), tmp_path / "a.rrd", SILENT)
+    assert b"phase 5" in (tmp_path / "a.rrd").read_bytes()
+
+
 def recorded_messages(bag: pathlib.Path):
     """Topic, time and message of everything in a bag."""
     typesys = pytest.importorskip("rosbags.typesys")
