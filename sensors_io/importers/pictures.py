@@ -101,26 +101,25 @@ def read_pictures(paths: Seq[pathlib.Path], positions: np.ndarray, keep: Keep) -
     Raises:
       PictureError: none can be read.
     """
-    frames: list[np.ndarray] = []
-    index: list[int] = []
-    lost: list[tuple[int, Skip]] = []
-    size_px = (0, 0)
+    by_size: dict[tuple[int, int], dict[int, np.ndarray]] = {}
+    reasons: dict[int, str] = {}
     for position in positions.tolist():
-        path = paths[position]
         try:
-            image = read_picture(path)
-            if frames and image.shape[:2] != size_px:
-                raise PictureError(f"has {image.shape[:2]} pixels, those before it {size_px}")
+            image = read_picture(paths[position])
         except PictureError as error:
-            lost.append((position, Skip(name=f"{path.parent.name}/{path.name}", reason=str(error))))
-            continue
-        size_px = image.shape[:2]
-        frames.append(keep.shrink(image))
-        index.append(position)
+            reasons[position] = str(error)
+        else:
+            by_size.setdefault(image.shape[:2], {})[position] = keep.shrink(image)
+    size_px, frames = max(by_size.items(), key=lambda found: len(found[1]), default=((0, 0), {}))
+    for size, others in by_size.items():
+        if size != size_px:
+            reasons |= dict.fromkeys(others, f"has {size} pixels, most have {size_px}")
+    named = lambda path, reason: Skip(name=f"{path.parent.name}/{path.name}", reason=reason)
+    lost = tuple((position, named(paths[position], reasons[position])) for position in sorted(reasons))
     if not frames:
         first = f"; the first: {lost[0][1].name} {lost[0][1].reason}" if lost else ""
         raise PictureError(f"holds no picture that can be read{first}")
-    return ReadPictures(frames=np.stack(frames), index=np.array(index), lost=tuple(lost), size_px=size_px)
+    return ReadPictures(frames=np.stack([*frames.values()]), index=np.array([*frames]), lost=lost, size_px=size_px)
 
 
 def numbered(folder: pathlib.Path, suffixes: tuple[str, ...] = (".jpg", ".jpeg", ".png")) -> list[pathlib.Path]:

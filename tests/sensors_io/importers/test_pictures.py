@@ -46,6 +46,10 @@ def test_lost_pictures_are_named_and_mark_the_frame_behind_them(tmp_path):
     assert pictures.after_loss().tolist() == [False, True, True]
     assert [skip.name for skip in pictures.left_out] == ["f/1.png", "f/2.png", "f/4.png"]
     np.testing.assert_array_equal(pictures.frames[:, 20, 20, 0], [0, 60, 100])
+    picture(paths[0], shape=(10, 32))  # a preview ahead of the others
+    pictures = read_pictures([paths[0], paths[3], paths[5]], np.arange(3), WHOLE)
+    assert pictures.index.tolist() == [1, 2]
+    assert [skip.reason for skip in pictures.left_out] == ["has (10, 32) pixels, most have (24, 32)"]
 
 
 def test_pictures_are_shrunk_and_chosen_by_position(tmp_path):

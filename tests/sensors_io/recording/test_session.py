@@ -68,6 +68,13 @@ def test_a_contact_let_go_too_early_is_kept_and_asked_for_again(tmp_path):
     assert session(tmp_path, Hand(), SHORT).contacts == 0
 
 
+def test_a_stage_that_no_attempt_completes_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr("sensors_io.recording.book.ATTEMPTS", 2)
+    report = session(tmp_path, Hand(slips_at=(1, 2)), SHORT)
+    assert (report.contacts, report.incomplete, report.given_up) == (3, 2, ["slide_x at 2 N"])
+    assert session(tmp_path, Hand(), SHORT).given_up == ["slide_x at 2 N"]
+
+
 def test_free_motion_alone_needs_no_force_sensor(tmp_path):
     hand = Hand()
     said = "gelsight_mini tells no force.*--free-s 10"
