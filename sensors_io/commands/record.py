@@ -126,6 +126,8 @@ class Record(Bench):
         ):
             if count:
                 OUT.print(f"{count} frames {problem}", highlight=False, soft_wrap=True)
+        for sensor, count in report.absent.items():
+            OUT.print(f"{sensor} gave no frame in {count} of {report.contacts} contacts", highlight=False)
         if report.given_up:
             stages = ", ".join(report.given_up)
             OUT.print(f"given up after {ATTEMPTS} attempts: {stages}; name another --site", soft_wrap=True)

@@ -18,6 +18,7 @@ from sensors_io.schema import ContactKey, Flag, Sequence
 _END = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND\xaeB`\x82"}
 """First and last bytes of JPEG and PNG; OpenCV decodes the rest of a truncated file as grey without an error."""
 
+_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # first bytes of a file of one picture, or of many
 _TAIL = 64  # bytes that some cameras append behind the end
 
 
@@ -79,10 +80,13 @@ def decode_picture(data: bytes) -> np.ndarray:
     try:
         how = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH
         image = cv2.imdecode(np.frombuffer(data, np.uint8), how) if data else None
+        pages = cv2.imdecodemulti(np.frombuffer(data, np.uint8), how)[1] if data[:4] in _TIFF else ()
     except cv2.error as error:  # it states more pixels than OpenCV makes room for
         raise PictureError("is larger than any picture") from error
     if image is None:
         raise PictureError("does not open as a picture")
+    if (count := sum(page.shape == image.shape for page in pages)) > 1:  # a preview of another size may follow
+        raise PictureError(f"holds {count} pictures: must hold one; write each into a file of its own")
     if image.dtype != np.uint8:
         raise PictureError(
             f"holds {image.dtype}: must hold 8 bits a channel; convert it, by the range that its camera fills"
@@ -157,7 +161,7 @@ def in_order(files: Seq[pathlib.Path]) -> list[pathlib.Path]:
     Raises:
       ImportSourceError: as `numbered`.
     """
-    files = sorted(files, key=lambda path: (natural(path), path.name))
+    files = sorted(files, key=lambda path: (natural(path.with_suffix("")), path.name))  # a.png before a (2).png
     decimal = lambda path: [float(part) if part[0].isdecimal() else part for part in _DECIMALS.findall(path.stem)]
     for first, then in itertools.pairwise(files):
         before, after = decimal(first), decimal(then)

@@ -36,6 +36,14 @@ def test_colours_are_rgb_and_a_picture_that_was_cut_off_is_refused(tmp_path, nam
         refused(PictureError, "holds uint16: must hold 8 bits", read_picture, path)
 
 
+def test_a_stack_of_pictures_is_not_its_first_one(tmp_path):
+    pages = [np.full((24, 32, 3), 20 * n, np.uint8) for n in range(3)]
+    cv2.imwritemulti(str(tmp_path / "a.tif"), pages)
+    refused(PictureError, "holds 3 pictures: must hold one", read_picture, tmp_path / "a.tif")
+    cv2.imwritemulti(str(tmp_path / "a.tif"), [pages[1], pages[2][::4, ::4]])  # a preview
+    assert read_picture(tmp_path / "a.tif").max() == 20
+
+
 def test_lost_pictures_are_named_and_mark_the_frame_behind_them(tmp_path):
     paths = [picture(tmp_path / "f" / f"{n}.png", 20 * n) for n in range(6)]
     cut(paths[1])
@@ -65,6 +73,11 @@ def test_names_are_ordered_by_their_numbers(tmp_path):
         (tmp_path / name).touch()
     assert [path.name for path in numbered(tmp_path)] == ["frame_9.png", "frame_10.png", "frame_100.png"]
     assert numbered(tmp_path / "absent") == []
+    for name in ("b3/shot (2).png", "b3/shot.png", "b4/1.5.png", "b4/1.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    ordered = [path.name for folder in ("b3", "b4") for path in numbered(tmp_path / folder)]
+    assert ordered == ["shot.png", "shot (2).png", "1.png", "1.5.png"]
     (tmp_path / "a2").mkdir()
     for name in ("a2/0.2.png", "a2/0.15.png"):
         (tmp_path / name).touch()
@@ -73,7 +86,7 @@ def test_names_are_ordered_by_their_numbers(tmp_path):
     (tmp_path / "a10").mkdir()
     (tmp_path / "a10" / "1.png").touch()
     names = [path.relative_to(tmp_path).as_posix() for path in below(tmp_path, {".png"})]
-    assert names[2:] == ["frame_100.png", "a2/0.15.png", "a2/0.20.png", "a10/1.png"]
+    assert names[2:6] == ["frame_100.png", "a2/0.15.png", "a2/0.20.png", "a10/1.png"]
 
 
 def test_links_are_followed_and_hidden_names_are_left_alone(tmp_path):

@@ -156,6 +156,16 @@ def test_two_sensors_make_one_contact_on_one_clock(tmp_path):
     assert first[1] - first[0] == 30 * MS
 
 
+def test_a_sensor_that_gives_nothing_is_told(tmp_path):
+    class Silent(Camera):
+        def drain(self):
+            return []
+
+    hand = Hand()
+    report = record_session(tmp_path, SHORT, [Camera(hand), Silent(hand, "digit")], Scale(hand), show=hand.show)
+    assert (report.contacts, report.absent) == (2, {"digit": 2})
+
+
 def test_the_gel_at_rest_and_the_object_are_kept(tmp_path):
     """The gel before each contact, where the force says that nothing touches; extraction finds it by its name."""
     view = ObjectView(
