@@ -153,14 +153,14 @@ class RecordedContact:
     @property
     def identity(self) -> Identity:
         s = self._sequence
-        period = float(np.median(np.diff(s.host_time_ns))) / NS_PER_S if len(s) > 1 else None
+        period = float(np.median(np.diff(s.host_time_ns))) / NS_PER_S if len(s) > 1 else 0.0
         return Identity(
             sensor=s.sensor,
             serial=s.serial,
             product="records",
             where=str(self.path),
             settings=s.camera,
-            period_s=period,
+            period_s=period or None,
             mm_per_px=s.mm_per_px,
         )
 
@@ -177,7 +177,12 @@ class RecordedContact:
                 f"{self.path}: contact {self.contact} was seen by {', '.join(contact)}, not {self.sensor!r}; "
                 "name one of these"
             )
-        return contact[self.sensor]
+        sequence = contact[self.sensor]
+        if (np.diff(sequence.host_time_ns) < 0).any():
+            raise DeviceNotFoundError(
+                f"{self.path}: the times of contact {self.contact} run backwards: must rise; replay another one"
+            )
+        return sequence
 
     def samples(self) -> Iterator[Recorded]:
         s = self._sequence

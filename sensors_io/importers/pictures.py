@@ -137,7 +137,7 @@ def numbered(folder: pathlib.Path, suffixes: tuple[str, ...] = (".jpg", ".jpeg",
 
 
 def inside(folder: pathlib.Path) -> Iterator[pathlib.Path]:
-    """All files and folders below a folder, also behind links, but for hidden ones: macOS writes ._a.png beside a.png."""
+    """All that lies below a folder, also behind links, but for hidden names: macOS writes ._a.png beside a.png."""
     for place, folders, files in os.walk(folder, followlinks=True):
         path, true = pathlib.Path(place), os.path.realpath(place)
         above = {true, *map(str, pathlib.Path(true).parents)}  # a link back to one of them has no end

@@ -132,6 +132,15 @@ def test_a_bag_holds_pictures_depth_force_and_flags_in_the_units_of_ros(tmp_path
     assert last["image"].header.frame_id == "gelsight_mini"
 
 
+def test_a_time_beyond_those_of_ros_is_named(tmp_path):
+    pytest.importorskip("rosbags")
+    with RecordWriter(tmp_path / "records", meta=fakes.META) as writer:
+        writer.write_object(fakes.card())
+        writer.write_contact([fakes.sequence(length=2, host_time_ns=np.array([0, 2**62]))])
+    selected = Selected(store=RecordStore(tmp_path / "records"))
+    refused(ExportError, f"a time is {2**62} ns: must be < ", export_rosbag, selected, tmp_path / "bag", SILENT)
+
+
 class FakeNode:
     """A node of rclpy that keeps what is published, and whose clock is 1,000 s ahead of the host's."""
 

@@ -83,6 +83,7 @@ def test_free_motion_alone_needs_no_force_sensor(tmp_path):
     assert record_session(tmp_path, config, [Camera(hand)], None, show=hand.show).contacts == 1
     made = RecordStore(tmp_path).contact(0)["gelsight_mini"]
     assert (made.key.motion, len(made), made.force_n) == ("free", 51, None)
+    assert hand.statuses[0].advice.prompt.endswith("s left; touch nothing yet, for the gel at rest")
 
 
 CHILD = """
