@@ -194,7 +194,7 @@ def _pack(kind: str, plain: Mapping[str, Any], arrays: Mapping[str, np.ndarray |
             f"{where}: its settings cannot be stored as JSON ({error}); use plain numbers and text"
         ) from error
     checksum = zlib.crc32(struct.pack("<I", len(text)))
-    for part in (text, *payloads):
+    for part in (memoryview(text), *payloads):
         checksum = zlib.crc32(part, checksum)
     return b"".join([_PREFIX.pack(_MAGIC, checksum, len(text)), text, *payloads])
 

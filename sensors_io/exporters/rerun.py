@@ -61,7 +61,7 @@ def _log_sequence(rr: Any, log: Any, name: str, sequence: Sequence, start_ns: in
             log.log(f"{name}/force", rr.Scalars(sequence.force_n[n].astype(np.float64)))
         flags = [str(flag.name).lower() for flag in Flag if int(sequence.flags[n]) & flag]
         phase = int(sequence.phase[n])
-        word = Phase(phase).name.lower() if phase in iter(Phase) else f"phase {phase}"
+        word = Phase(phase).name.lower() if phase in set(Phase) else f"phase {phase}"
         log.log(f"{name}/flags", rr.TextLog(" ".join([word, *flags])))
 
 

@@ -91,7 +91,7 @@ def export_rosbag(selected: Selected, out: pathlib.Path, progress: Progress) -> 
                 for stamp, said in sorted(_moments(contact, later, make), key=lambda moment: moment[0]):
                     if (end := stamp) >= _END_NS:
                         raise ExportError(
-                            f"a time is {stamp} ns: must be < {_END_NS}, those of ROS; leave its contact out by --contacts"
+                            f"a time is {stamp} ns: must be < {_END_NS}, those of ROS; leave it out by --contacts"
                         )
                     if said.topic not in connections:
                         connections[said.topic] = bag.add_connection(said.topic, said.kind, typestore=store)
