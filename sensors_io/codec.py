@@ -168,7 +168,8 @@ def quantise(name: str, x: np.ndarray, *, where: str) -> tuple[np.ndarray, float
 
 
 def _pack(kind: str, plain: Mapping[str, Any], arrays: Mapping[str, np.ndarray | None], *, where: str) -> bytes:
-    described, payloads = [], []
+    described = list[dict[str, Any]]()
+    payloads = list[memoryview]()  # not copied: minutes of pictures are gigabytes
     for name, array in arrays.items():
         if array is None:
             continue
@@ -182,17 +183,20 @@ def _pack(kind: str, plain: Mapping[str, Any], arrays: Mapping[str, np.ndarray |
             array = difference(array, entry["filter"])
         entry["dtype"] = array.dtype.newbyteorder("<").str
         described.append(entry)
-        payloads.append(_padded(np.ascontiguousarray(array).astype(entry["dtype"], copy=False).tobytes()))
+        stored = np.ascontiguousarray(array).astype(entry["dtype"], copy=False).reshape(-1)
+        payloads += [stored.view(np.uint8).data, memoryview(_padding(stored.nbytes))]
     header = {"kind": kind, "plain": plain, "arrays": described}
     try:
-        text = _padded(json.dumps(header, allow_nan=False).encode(), b" ", offset=_PREFIX.size)
+        text = json.dumps(header, allow_nan=False).encode()
+        text += _padding(_PREFIX.size + len(text), b" ")
     except (TypeError, ValueError) as error:
         raise SchemaError(
             f"{where}: its settings cannot be stored as JSON ({error}); use plain numbers and text"
         ) from error
-    body = b"".join([text, *payloads])
-    size = struct.pack("<I", len(text))
-    return _PREFIX.pack(_MAGIC, zlib.crc32(body, zlib.crc32(size)), len(text)) + body
+    checksum = zlib.crc32(struct.pack("<I", len(text)))
+    for part in (memoryview(text), *payloads):
+        checksum = zlib.crc32(part, checksum)
+    return b"".join([_PREFIX.pack(_MAGIC, checksum, len(text)), text, *payloads])
 
 
 def _wide(name: str, x: np.ndarray) -> bool:
@@ -244,5 +248,5 @@ def _undo(array: np.ndarray, entry: Mapping[str, Any]) -> np.ndarray:
     return accumulate(array, entry["filter"])
 
 
-def _padded(data: bytes, fill: bytes = b"\0", offset: int = 0) -> bytes:
-    return data + fill * (-(len(data) + offset) % 8)
+def _padding(size: int, fill: bytes = b"\0") -> bytes:
+    return fill * (-size % 8)

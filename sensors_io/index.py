@@ -34,6 +34,7 @@ READABLE = (1, 2, 3)
 """Versions whose records this code reads; 1 stored camera frames as they are, 2 stores differences, 3 has tables."""
 
 INDEX = "index.json"
+JOURNALS = ".journals"  # of contacts that are being recorded
 
 TABLES = ("contacts", "contact-shards", "objects", "object-shards")
 
@@ -261,7 +262,10 @@ def read_root(root: Place) -> tuple[dict[str, Any], str]:
       MissingIndexError, RecordsVersionError, CorruptRecordsError, RecordsError: as `Index.read`.
     """
     if isinstance(root, pathlib.Path) and not (root / INDEX).is_file():
-        raise MissingIndexError(f"{root} has no {INDEX}: give the directory of a data set, or write one there first")
+        killed = " (a recording was killed: the same `record` brings it in)" if (root / JOURNALS).is_dir() else ""
+        raise MissingIndexError(
+            f"{root} has no {INDEX}: give the directory of a data set, or write one there first{killed}"
+        )
     path = f"{root}/{INDEX}"
     try:
         data = local(root, INDEX).read_bytes()

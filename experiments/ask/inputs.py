@@ -172,17 +172,17 @@ def filmed_sequence(path: Path, sensor: str) -> TouchSequence:
             pictures = read_pictures(files, keep.positions(len(files)), keep)
             if pictures.left_out:
                 raise UnreadableError(f"{pictures.left_out[0].name} {pictures.left_out[0].reason}, remove it")
-            index, rate_hz = pictures.index, FILM_RATE_HZ
+            times = nominal_ns(pictures.index, FILM_RATE_HZ)
             arrays = {"frames": pictures.frames, "gap": pictures.after_loss()}
         else:
             video = read_video(path, keep)
-            index, rate_hz = video.index, video.rate_hz
+            times = video.time_ns
             arrays = {"frames": video.frames, "gap": np.zeros(len(video.index), bool)}
     except UnreadableError as error:
         raise DataError(f"input is {path}: {error}; give a video, a folder of pictures or of records") from error
     name = re.sub(r"[^A-Za-z0-9]+", "-", path.stem).strip("-") or "object"
     key = ContactKey(object_id=name, site=0, motion="free", trial=0)
-    return film(key, sensor, host_time_ns=nominal_ns(index, rate_hz), **arrays)
+    return film(key, sensor, host_time_ns=times, **arrays)
 
 
 def _asked(contact: Mapping[str, TouchSequence], card: ObjectCard, saved: SavedPolicy, name: str) -> AskedTouch:

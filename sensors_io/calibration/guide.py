@@ -96,7 +96,8 @@ class PressGuide:
 
     def look(self, frame: np.ndarray) -> Guidance:
         """Guidance after one more frame, uint8 [H, W, 3] RGB."""
-        if self._still and float(cv2.absdiff(frame, self._still[-1]).mean()) > self._config.still_levels:
+        last = self._still[-1] if self._still else frame
+        if frame.shape != last.shape or float(cv2.absdiff(frame, last).mean()) > self._config.still_levels:
             self._still = []
         self._still.append(frame)
         if self.background is None:

@@ -12,6 +12,7 @@ from sensors_io.commands.console import OUT, complain, progress_bar
 from sensors_io.fields.recorded import RecordedGels, RestGel, recorded_fields
 from sensors_io.fields.sources import read_picture
 from sensors_io.fields.types import Calibration, CalibrationError
+from sensors_io.index import JOURNALS
 from sensors_io.records import CorruptRecordsError, IncompleteRecordsError, RecordsError, RecordStore
 
 
@@ -45,7 +46,7 @@ class Check:
         ranges = overview.ValueRanges()
         unseen: collections.Counter[str] = collections.Counter()
         problems: list[RecordsError] = []
-        gels = self._gels(store)
+        gels, left_out = self._gels(store), _left_out(store)
         with progress_bar("contacts") as progress:
             for i in range(len(store)):
                 try:
@@ -54,6 +55,7 @@ class Check:
                     problems.append(damage)
                     continue
                 for sequence in contact:
+                    left_out[_OTHERS] += sequence.camera.get("recording", {}).get("left_out", 0)
                     recorded.add(sequence)
                     ranges.add(sequence)
                     found = quality.judge(sequence)
@@ -68,8 +70,7 @@ class Check:
                     looked.add(dataclasses.replace(sequence, flags=flags), extractor.judged)
                 progress(i + 1, len(store))
         OUT.print(overview.summary_table(store))
-        left_out = _left_out(store)
-        if left_out:
+        if left_out := +left_out:
             OUT.print(_counted(left_out))
         if ranges.found:
             OUT.print(overview.range_table(ranges))
@@ -82,6 +83,13 @@ class Check:
                 OUT.print(f"not looked at: {count} sequences, {reason}", highlight=False)
         if not store.complete:
             problems.append(IncompleteRecordsError(f"{self.records}: its writing has not ended; run its command again"))
+        if journals := [*(self.records / JOURNALS).glob("*.journal"), *(self.records / JOURNALS).glob("*.refused")]:
+            problems.append(
+                IncompleteRecordsError(
+                    f"{journals[0].parent} holds {len(journals)} contacts that are not in the records: the next "
+                    "`record` there brings in what a killed one left, and says what it refuses"
+                )
+            )
         for problem in problems:
             complain(problem)
         return 1 if problems else 0
@@ -99,7 +107,7 @@ def _left_out(store: RecordStore) -> collections.Counter[str]:
 
 
 def _counted(reasons: collections.Counter[str]) -> Table:
-    table = Table("left out when imported or extracted", "count")
+    table = Table("left out when imported, recorded or extracted", "count")
     for reason, count in reasons.most_common(_MOST_REASONS):
         table.add_row(reason, str(count))
     rest = len(reasons) - _MOST_REASONS
@@ -108,4 +116,5 @@ def _counted(reasons: collections.Counter[str]) -> Table:
     return table
 
 
+_OTHERS = "frame recorded in another size than most of its contact"
 _MOST_REASONS = 12  # that are listed one by one

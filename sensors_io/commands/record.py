@@ -23,7 +23,7 @@ from sensors_io.devices.rgbd_camera import RgbdCameraConfig
 from sensors_io.force import Mount
 from sensors_io.offsets import Offsets
 from sensors_io.poses import ForceZero
-from sensors_io.recording.book import ObjectView
+from sensors_io.recording.book import ATTEMPTS, ObjectView
 from sensors_io.recording.coach import CoachConfig
 from sensors_io.recording.session import SessionConfig, Status, record_session
 from sensors_io.viewer.presenter import Presenter
@@ -120,7 +120,18 @@ class Record(Bench):
                 self.out, config, tactile, force[0] if force else None, show=show, view=view, stop=stop.is_set
             )
         OUT.print(f"{report.contacts} contacts written, {report.recovered} recovered, {report.incomplete} incomplete")
-        if not report.contacts and not stop.is_set():
+        for count, problem in (
+            (report.left_out, "were left out: their size differs from most of their contact; hold it, as by --width"),
+            (report.broken, "hold values that no sensor measures: flagged incomplete"),
+        ):
+            if count:
+                OUT.print(f"{count} frames {problem}", highlight=False, soft_wrap=True)
+        for sensor, count in report.absent.items():
+            OUT.print(f"{sensor} gave no frame in {count} of {report.contacts} contacts", highlight=False)
+        if report.given_up:
+            stages = ", ".join(report.given_up)
+            OUT.print(f"given up after {ATTEMPTS} attempts: {stages}; name another --site", soft_wrap=True)
+        elif not report.contacts and not stop.is_set():
             OUT.print(
                 f"nothing was missing: {self.object_id}, site {self.site} is complete; name another --site",
                 markup=False,

@@ -15,7 +15,7 @@ from sensors_io.calibration.guide import Guidance, GuideConfig, PressGuide, draw
 from sensors_io.commands.choices import Bench, opened, stop_on_interrupt
 from sensors_io.commands.console import OUT
 from sensors_io.devices.base import Device
-from sensors_io.devices.errors import DeviceNotFoundError, DeviceTimeoutError, StreamEndedError
+from sensors_io.devices.errors import DeviceDataError, DeviceNotFoundError, DeviceTimeoutError, StreamEndedError
 from sensors_io.fields.sources import read_picture
 from sensors_io.fields.types import CalibrationError, write_whole
 from sensors_io.index import INDEX
@@ -61,11 +61,14 @@ class Snap(Bench):
             stack.enter_context(write_lock(self.out))
             live = stack.enter_context(LiveView(port=self.port))
             OUT.print(f"guidance at {live.address}, Ctrl-C ends", highlight=False)
-            guide, said, ended = self._guide(pitch), "", ""
+            guide, said, ended, broken = self._guide(pitch), "", "", 0
             while not stop.is_set() and not guide.done:
                 try:
                     sample = device.read(_TIMEOUT_S)
                 except DeviceTimeoutError:
+                    continue
+                except DeviceDataError:
+                    broken += 1
                     continue
                 except StreamEndedError as end:
                     ended = str(end)
@@ -78,6 +81,8 @@ class Snap(Bench):
                 if guidance.prompt.partition(",")[0] != said:
                     said = guidance.prompt.partition(",")[0]
                     OUT.print(guidance.prompt, markup=False, highlight=False)
+        if broken:
+            OUT.print(f"{broken} broken samples were left out", highlight=False)
         self._close(guide, pitch)
         if ended and not guide.touches:
             raise StreamEndedError(f"{ended}, before a press was taken; replay a longer recording")

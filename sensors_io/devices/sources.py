@@ -15,6 +15,7 @@ from sensors_io.devices.base import Identity
 from sensors_io.devices.errors import DeviceNotFoundError, StreamEndedError
 from sensors_io.errors import path_text
 from sensors_io.importers.pictures import PictureError, below, read_picture
+from sensors_io.importers.video import is_cut_off
 from sensors_io.records import RecordStore
 from sensors_io.schema import FRAME_ARRAYS, Flag, Sequence
 
@@ -82,7 +83,7 @@ class PictureFolder:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class VideoFile:
-    """The frames of a video file, at its own rate."""
+    """The frames of a video file, at its own times; at its rate where its stamps do not rise."""
 
     path: pathlib.Path
     sensor: str = "gelsight_mini"
@@ -105,18 +106,24 @@ class VideoFile:
     def samples(self) -> Iterator[Recorded]:
         capture = self._open()
         try:
-            count = 0
+            count = time_ns = 0
+            last_ms = first_ms = 0.0
             stated = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
             while capture.grab():
                 ok, image = capture.retrieve()
                 if not ok:
                     break
-                time_ns = round(count * NS_PER_S / self._rate_hz)
+                last_ms = capture.get(cv2.CAP_PROP_POS_MSEC)
+                if count == 0:
+                    first_ms = last_ms
+                else:
+                    own_ns = round((last_ms - first_ms) * 1e6)
+                    time_ns = own_ns if own_ns > time_ns else round(time_ns + NS_PER_S / self._rate_hz)
                 yield Recorded(time_ns=time_ns, index=count, frame=cv2.cvtColor(image, cv2.COLOR_BGR2RGB), arrays={})
                 count += 1
         finally:
             capture.release()
-        if count < stated:
+        if is_cut_off(self.path, stated, count, self._rate_hz, last_ms):
             raise StreamEndedError(
                 f"{self.path} is cut off: {count} of {stated} frames could be decoded and were replayed; put a whole "
                 "copy back"
@@ -146,14 +153,14 @@ class RecordedContact:
     @property
     def identity(self) -> Identity:
         s = self._sequence
-        period = float(np.median(np.diff(s.host_time_ns))) / NS_PER_S if len(s) > 1 else None
+        period = float(np.median(np.diff(s.host_time_ns))) / NS_PER_S if len(s) > 1 else 0.0
         return Identity(
             sensor=s.sensor,
             serial=s.serial,
             product="records",
             where=str(self.path),
             settings=s.camera,
-            period_s=period,
+            period_s=period or None,
             mm_per_px=s.mm_per_px,
         )
 
@@ -170,7 +177,12 @@ class RecordedContact:
                 f"{self.path}: contact {self.contact} was seen by {', '.join(contact)}, not {self.sensor!r}; "
                 "name one of these"
             )
-        return contact[self.sensor]
+        sequence = contact[self.sensor]
+        if (np.diff(sequence.host_time_ns) < 0).any():
+            raise DeviceNotFoundError(
+                f"{self.path}: the times of contact {self.contact} run backwards: must rise; replay another one"
+            )
+        return sequence
 
     def samples(self) -> Iterator[Recorded]:
         s = self._sequence

@@ -60,7 +60,9 @@ def _log_sequence(rr: Any, log: Any, name: str, sequence: Sequence, start_ns: in
         if sequence.force_n is not None:
             log.log(f"{name}/force", rr.Scalars(sequence.force_n[n].astype(np.float64)))
         flags = [str(flag.name).lower() for flag in Flag if int(sequence.flags[n]) & flag]
-        log.log(f"{name}/flags", rr.TextLog(" ".join([Phase(int(sequence.phase[n])).name.lower(), *flags])))
+        phase = int(sequence.phase[n])
+        word = Phase(phase).name.lower() if phase in set(Phase) else f"phase {phase}"
+        log.log(f"{name}/flags", rr.TextLog(" ".join([word, *flags])))
 
 
 def _arrows(rr: Any, field: np.ndarray) -> Any:

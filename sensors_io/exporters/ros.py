@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from sensors_io.exporters.selection import Progress, Selected, library, published
+from sensors_io.exporters.selection import ExportError, Progress, Selected, library, published
 from sensors_io.schema import Sequence
 
 Make = Callable[..., Any]
@@ -23,6 +23,7 @@ Make = Callable[..., Any]
 
 IMAGE, WRENCH, FLAGS = "sensor_msgs/msg/Image", "geometry_msgs/msg/WrenchStamped", "std_msgs/msg/UInt32"
 
+_END_NS = 2**31 * 10**9  # of the times of ROS
 APART_NS = 10**9
 """Between two contacts whose own times overlap, as those of imported and generated records do: each begins at 0."""
 
@@ -75,7 +76,7 @@ def export_rosbag(selected: Selected, out: pathlib.Path, progress: Progress) -> 
     Stamps are the recorded times; a contact that does not begin after the one before is put `APART_NS` behind it.
 
     Raises:
-      ExportError: `out` exists, or rosbags is not installed.
+      ExportError: `out` exists, rosbags is not installed, or a time is beyond those of ROS.
     """
     typesys, rosbag2 = library("rosbags.typesys", "ros"), library("rosbags.rosbag2", "ros")
     store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
@@ -88,7 +89,10 @@ def export_rosbag(selected: Selected, out: pathlib.Path, progress: Progress) -> 
                 start = min(int(sequence.host_time_ns.min()) for sequence in contact.values())
                 later = 0 if start > end else end + APART_NS - start
                 for stamp, said in sorted(_moments(contact, later, make), key=lambda moment: moment[0]):
-                    end = stamp
+                    if (end := stamp) >= _END_NS:
+                        raise ExportError(
+                            f"a time is {stamp} ns: must be < {_END_NS}, those of ROS; leave it out by --contacts"
+                        )
                     if said.topic not in connections:
                         connections[said.topic] = bag.add_connection(said.topic, said.kind, typestore=store)
                     bag.write(connections[said.topic], stamp, store.serialize_cdr(said.message, said.kind))

@@ -104,7 +104,7 @@ def _read(path: pathlib.Path, sensor: str) -> Iterator[_Shot]:
         if not files:
             kinds = ", ".join(sorted(PICTURES))
             raise SourceError(f"{path} holds no picture ({kinds}): name a folder that does")
-        if films := [f for f in path.rglob("*") if f.suffix.lower() in VIDEOS]:
+        if films := [f for f in pictures.inside(path) if f.suffix.lower() in VIDEOS]:
             raise SourceError(
                 f"{path} holds pictures and videos, such as {films[0]}: must be one kind; name them apart"
             )

@@ -20,7 +20,7 @@ import numpy as np
 from sensors_io.importers.catalogue import Catalogue, Listed, Taken, bare_catalogue, require_files
 from sensors_io.importers.keep import ImportConfig, Skip, UnreadableError
 from sensors_io.importers.pickles import read_pickle
-from sensors_io.importers.pictures import film, natural, nominal_ns
+from sensors_io.importers.pictures import film, inside, natural, nominal_ns
 from sensors_io.importers.video import read_video
 from sensors_io.schema import ContactKey
 
@@ -34,7 +34,7 @@ def list_estimate_modulus(source: pathlib.Path, config: ImportConfig) -> Catalog
     Raises:
       ImportSourceError: no .avi there.
     """
-    found = (path for path in source.rglob("*") if path.suffix.lower() == ".avi")
+    found = (path for path in inside(source) if path.suffix.lower() == ".avi")
     videos = sorted(found, key=lambda path: (path.parent, natural(path)))
     require_files(source, videos, "<object>_<n>.avi with <object>_<n>_forces.pkl")
     contacts, skipped, trials = [], [], collections.Counter[str]()

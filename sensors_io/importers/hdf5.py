@@ -34,6 +34,7 @@ from sensors_io.importers.hdf5_read import (
 )
 from sensors_io.importers.holdout import split_by_name
 from sensors_io.importers.keep import ImportConfig, ImportSourceError, Skip
+from sensors_io.importers.pictures import inside
 from sensors_io.schema import ATTRIBUTES, MATERIALS, ContactKey, ObjectCard, SchemaError
 
 SUFFIXES = (".h5", ".hdf5", ".hdf")
@@ -132,8 +133,8 @@ def hdf5_files(source: pathlib.Path) -> list[pathlib.Path]:
     Raises:
       ImportSourceError: there are none.
     """
-    inside = [source] if source.is_file() else sorted(source.rglob("*"))
-    files = [path for path in inside if path.suffix.lower() in SUFFIXES and path.is_file()]
+    found = [source] if source.is_file() else sorted(inside(source))
+    files = [path for path in found if path.suffix.lower() in SUFFIXES and path.is_file()]
     require_files(source, files, f"HDF5 files ({', '.join(SUFFIXES)})")
     return files
 

@@ -2,9 +2,10 @@
 
 import dataclasses
 import itertools
+import os
 import pathlib
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from collections.abc import Sequence as Seq
 from typing import Any
 
@@ -17,6 +18,7 @@ from sensors_io.schema import ContactKey, Flag, Sequence
 _END = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND\xaeB`\x82"}
 """First and last bytes of JPEG and PNG; OpenCV decodes the rest of a truncated file as grey without an error."""
 
+_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # first bytes of a file of one picture, or of many
 _TAIL = 64  # bytes that some cameras append behind the end
 
 
@@ -78,10 +80,13 @@ def decode_picture(data: bytes) -> np.ndarray:
     try:
         how = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH
         image = cv2.imdecode(np.frombuffer(data, np.uint8), how) if data else None
+        pages = cv2.imdecodemulti(np.frombuffer(data, np.uint8), how)[1] if data[:4] in _TIFF else ()
     except cv2.error as error:  # it states more pixels than OpenCV makes room for
         raise PictureError("is larger than any picture") from error
     if image is None:
         raise PictureError("does not open as a picture")
+    if (count := sum(page.shape == image.shape for page in pages)) > 1:  # a preview of another size may follow
+        raise PictureError(f"holds {count} pictures: must hold one; write each into a file of its own")
     if image.dtype != np.uint8:
         raise PictureError(
             f"holds {image.dtype}: must hold 8 bits a channel; convert it, by the range that its camera fills"
@@ -100,26 +105,25 @@ def read_pictures(paths: Seq[pathlib.Path], positions: np.ndarray, keep: Keep) -
     Raises:
       PictureError: none can be read.
     """
-    frames: list[np.ndarray] = []
-    index: list[int] = []
-    lost: list[tuple[int, Skip]] = []
-    size_px = (0, 0)
+    by_size: dict[tuple[int, int], dict[int, np.ndarray]] = {}
+    reasons: dict[int, str] = {}
     for position in positions.tolist():
-        path = paths[position]
         try:
-            image = read_picture(path)
-            if frames and image.shape[:2] != size_px:
-                raise PictureError(f"has {image.shape[:2]} pixels, those before it {size_px}")
+            image = read_picture(paths[position])
         except PictureError as error:
-            lost.append((position, Skip(name=f"{path.parent.name}/{path.name}", reason=str(error))))
-            continue
-        size_px = image.shape[:2]
-        frames.append(keep.shrink(image))
-        index.append(position)
+            reasons[position] = str(error)
+        else:
+            by_size.setdefault(image.shape[:2], {})[position] = keep.shrink(image)
+    size_px, frames = max(by_size.items(), key=lambda found: len(found[1]), default=((0, 0), {}))
+    for size, others in by_size.items():
+        if size != size_px:
+            reasons |= dict.fromkeys(others, f"has {size} pixels, most have {size_px}")
+    named = lambda path, reason: Skip(name=f"{path.parent.name}/{path.name}", reason=reason)
+    lost = tuple((position, named(paths[position], reasons[position])) for position in sorted(reasons))
     if not frames:
         first = f"; the first: {lost[0][1].name} {lost[0][1].reason}" if lost else ""
         raise PictureError(f"holds no picture that can be read{first}")
-    return ReadPictures(frames=np.stack(frames), index=np.array(index), lost=tuple(lost), size_px=size_px)
+    return ReadPictures(frames=np.stack([*frames.values()]), index=np.array([*frames]), lost=lost, size_px=size_px)
 
 
 def numbered(folder: pathlib.Path, suffixes: tuple[str, ...] = (".jpg", ".jpeg", ".png")) -> list[pathlib.Path]:
@@ -128,14 +132,23 @@ def numbered(folder: pathlib.Path, suffixes: tuple[str, ...] = (".jpg", ".jpeg",
     Raises:
       ImportSourceError: names such as 0.15.png and 0.2.png, whose order depends on what the point means.
     """
-    files = [f for f in folder.iterdir() if f.suffix.lower() in suffixes] if folder.is_dir() else []
-    return in_order(files)
+    files = list(folder.iterdir()) if folder.is_dir() else []
+    return in_order([f for f in files if f.suffix.lower() in suffixes and not f.name.startswith(".")])
+
+
+def inside(folder: pathlib.Path) -> Iterator[pathlib.Path]:
+    """All that lies below a folder, also behind links, but for hidden names: macOS writes ._a.png beside a.png."""
+    for place, folders, files in os.walk(folder, followlinks=True):
+        path, true = pathlib.Path(place), os.path.realpath(place)
+        above = {true, *map(str, pathlib.Path(true).parents)}  # a link back to one of them has no end
+        folders[:] = [f for f in folders if not f.startswith(".") and os.path.realpath(path / f) not in above]
+        yield from (path / name for name in (*folders, *files) if not name.startswith("."))
 
 
 def below(folder: pathlib.Path, suffixes: Collection[str]) -> list[pathlib.Path]:
     """Pictures of a folder and of those below it, folder by folder, as `numbered` orders them."""
     found: dict[pathlib.Path, list[pathlib.Path]] = {}
-    for path in folder.rglob("*"):
+    for path in inside(folder):
         if path.suffix.lower() in suffixes:
             found.setdefault(path.parent, []).append(path)
     folders = sorted(found, key=lambda path: [natural(part) for part in (*reversed(path.parents), path)])
@@ -148,7 +161,7 @@ def in_order(files: Seq[pathlib.Path]) -> list[pathlib.Path]:
     Raises:
       ImportSourceError: as `numbered`.
     """
-    files = sorted(files, key=lambda path: (natural(path), path.name))
+    files = sorted(files, key=lambda path: (natural(path.with_suffix("")), path.name))  # a.png before a (2).png
     decimal = lambda path: [float(part) if part[0].isdecimal() else part for part in _DECIMALS.findall(path.stem)]
     for first, then in itertools.pairwise(files):
         before, after = decimal(first), decimal(then)

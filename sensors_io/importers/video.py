@@ -11,8 +11,12 @@ import numpy as np
 
 from sensors_io.errors import UserError, path_text
 from sensors_io.importers.keep import LEAST_HZ, MOST_HZ, Keep, UnreadableError
+from sensors_io.importers.pictures import nominal_ns
 
 _MOST_STATED = 10**6  # frames that a header is believed
+_TIMED = (".mkv", ".webm")
+"""Files that state no number of frames: OpenCV takes the duration of their longest stream times a rate."""
+_SOUND_S = 0.25  # by which sound may outlast the pictures
 
 
 class VideoError(UnreadableError):
@@ -26,6 +30,7 @@ class VideoFrames:
     Args:
       frames: uint8 [N, H, W, 3], RGB.
       index: position of each kept frame in the file, int64 [N].
+      time_ns: of each, int64 [N]: by the stated rate, or by its stamps where they rise and leave it by over a period.
       rate_hz: frame rate that the container states.
       size_px: rows and columns before any shrinking.
       total: frames in the file.
@@ -33,6 +38,7 @@ class VideoFrames:
 
     frames: np.ndarray
     index: np.ndarray
+    time_ns: np.ndarray
     rate_hz: float
     size_px: tuple[int, int]
     total: int
@@ -57,17 +63,43 @@ def read_video(path: pathlib.Path, keep: Keep) -> VideoFrames:
         if not LEAST_HZ <= rate_hz <= MOST_HZ:
             raise VideoError(f"states a frame rate of {rate_hz}")
         expected = min(max(stated, 0), _MOST_STATED)
-        frames, total, size_px = _decode(capture, keep, keep.positions(expected))
+        frames, stamps_ms, size_px = _decode(capture, keep, keep.positions(expected))
+    total = len(stamps_ms)
     if not total:
         raise VideoError("holds no frame that can be decoded")
-    if total < stated:
-        raise VideoError(f"is cut off: {total} of {stated} frames can be decoded")
+    if is_cut_off(path, stated, total, rate_hz, stamps_ms[-1]):
+        sound = ", or its sound is longer" if path.suffix.lower() in _TIMED else ""
+        raise VideoError(f"is cut off{sound}: {total} of {stated} frames can be decoded")
     kept = keep.positions(total)
-    if total > expected:  # it states too few, so that others than these were kept
+    if total != expected:  # others than these were kept
         with _opened(path) as capture:
-            frames, total, size_px = _decode(capture, keep, kept)
+            frames, _, size_px = _decode(capture, keep, kept)
     images = np.stack([frames[n] for n in kept.tolist()])
-    return VideoFrames(frames=images, index=kept, rate_hz=rate_hz, size_px=size_px, total=total)
+    times = _times_ns(np.array(stamps_ms), rate_hz)[kept]
+    return VideoFrames(frames=images, index=kept, time_ns=times, rate_hz=rate_hz, size_px=size_px, total=total)
+
+
+def is_cut_off(path: pathlib.Path, stated: int, count: int, rate_hz: float, last_ms: float) -> bool:
+    """True if the end of a video is missing.
+
+    Args:
+      path: of the video.
+      stated: frames by its header.
+      count: frames that can be decoded.
+      rate_hz: that it states.
+      last_ms: stamp of the last frame.
+    """
+    if count >= stated or path.suffix.lower() not in _TIMED:
+        return count < stated
+    return (stated - 1) / rate_hz - last_ms / 1e3 > _SOUND_S
+
+
+def _times_ns(stamps_ms: np.ndarray, rate_hz: float) -> np.ndarray:
+    """Times of all frames since the first, as `VideoFrames.time_ns`."""
+    nominal = nominal_ns(np.arange(len(stamps_ms)), rate_hz)
+    own = np.rint((stamps_ms - stamps_ms[0]) * 1e6).astype(np.int64)
+    varies = (np.diff(own) > 0).all() and np.abs(own - nominal).max() > 1e9 / rate_hz
+    return own if varies else nominal
 
 
 @contextlib.contextmanager
@@ -88,17 +120,18 @@ def _opened(path: pathlib.Path) -> Iterator[cv2.VideoCapture]:
 
 def _decode(
     capture: cv2.VideoCapture, keep: Keep, kept: np.ndarray
-) -> tuple[dict[int, np.ndarray], int, tuple[int, int]]:
-    """Frames at some positions of an open video, of which all others are decoded and dropped; their number and size."""
+) -> tuple[dict[int, np.ndarray], list[float], tuple[int, int]]:
+    """Frames at some positions of an open video, of which others are decoded and dropped; stamps of all; their size."""
     frames: dict[int, np.ndarray] = {}
-    wanted, total, size_px = set(kept.tolist()), 0, (0, 0)
+    wanted, size_px = set(kept.tolist()), (0, 0)
+    stamps_ms: list[float] = []
     while capture.grab():
-        if total % keep.stride == 0:
+        if (position := len(stamps_ms)) % keep.stride == 0:
             ok, image = capture.retrieve()
             if not ok:
                 break
             size_px = image.shape[:2]
-            if total in wanted:
-                frames[total] = cv2.cvtColor(keep.shrink(image), cv2.COLOR_BGR2RGB)
-        total += 1
-    return frames, total, size_px
+            if position in wanted:
+                frames[position] = cv2.cvtColor(keep.shrink(image), cv2.COLOR_BGR2RGB)
+        stamps_ms.append(capture.get(cv2.CAP_PROP_POS_MSEC))
+    return frames, stamps_ms, size_px

@@ -24,7 +24,7 @@ from sensors_io.importers.catalogue import Catalogue, Listed, Taken, fingerprint
 from sensors_io.importers.holdout import split_by_name
 from sensors_io.importers.keep import LEAST_HZ, MOST_HZ, ImportConfig, ImportSourceError, Skip
 from sensors_io.importers.label_table import COLUMNS, ID, NAME, SPLIT, LabelRow, LabelsError, read_labels
-from sensors_io.importers.pictures import film, natural, nominal_ns, numbered, read_pictures
+from sensors_io.importers.pictures import film, inside, natural, nominal_ns, numbered, read_pictures
 from sensors_io.importers.video import read_video
 from sensors_io.schema import ATTRIBUTES, ContactKey, ObjectCard, SchemaError
 
@@ -123,16 +123,17 @@ def _clips(source: pathlib.Path) -> list[pathlib.Path]:
     """Videos and folders of pictures, the folder itself last, in the order of the numbers in their names."""
     if not source.is_dir():
         return []
-    inside = sorted(source.rglob("*"), key=lambda path: (natural(path.parent), natural(path)))
-    return [p for p in (*inside, source) if (p.is_file() and p.suffix.lower() in SUFFIXES) or numbered(p)]
+    found = sorted(inside(source), key=lambda path: (natural(path.parent), natural(path)))
+    return [p for p in (*found, source) if (p.is_file() and p.suffix.lower() in SUFFIXES) or numbered(p)]
 
 
 def _of_other_kinds(source: pathlib.Path, taken: Container[pathlib.Path]) -> Iterator[Skip]:
     """Pictures and videos that are read by other programs alone."""
-    for path in sorted(source.rglob("*")):
+    for path in sorted(inside(source)):
         if path not in taken and (mimetypes.guess_type(path.name)[0] or "").startswith(("image/", "video/")):
             name = path.relative_to(source).as_posix()
-            yield Skip(name=name, reason=f"is not read: must be of {_KINDS}; convert it")
+            problem = f"is not read: must be of {_KINDS}; convert it" if path.exists() else "is a link to nothing"
+            yield Skip(name=name, reason=problem)
 
 
 def _find(name: str, row: LabelRow, by_name: Mapping[str, Seq[str]], source: pathlib.Path) -> str:
@@ -210,9 +211,9 @@ def _said(card: ObjectCard) -> str:
 def _read(path: pathlib.Path, key: ContactKey, config: VideosConfig) -> Taken:
     if path.is_file():
         video = read_video(path, config)
-        gap, times = np.zeros(len(video.index), np.bool_), nominal_ns(video.index, video.rate_hz)
+        gap = np.zeros(len(video.index), np.bool_)
         camera = video.camera(path)
-        sequence = film(key, config.sensor, gap=gap, host_time_ns=times, camera=camera, frames=video.frames)
+        sequence = film(key, config.sensor, gap=gap, host_time_ns=video.time_ns, camera=camera, frames=video.frames)
         return Taken(sequences=(sequence,))
     paths = numbered(path)
     pictures = read_pictures(paths, config.positions(len(paths)), config)

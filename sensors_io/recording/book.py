@@ -1,5 +1,6 @@
 """The records of a session and the journals beside them: what is done, what is wanted next, what a kill left behind."""
 
+import collections
 import dataclasses
 import itertools
 import pathlib
@@ -43,12 +44,20 @@ class Report:
       recovered: those of them that came from journals of a killed session.
       incomplete: those of them that are asked for again.
       ended: the replay that ended before the session was complete, in words; empty otherwise.
+      left_out: frames of another size or with other arrays than most of their contact.
+      broken: frames with values that no sensor measures; they are flagged.
+      absent: contacts in which a sensor of the session gave no frame, by its name.
+      given_up: stages that `ATTEMPTS` contacts did not complete, in words.
     """
 
     contacts: int = 0
     recovered: int = 0
     incomplete: int = 0
     ended: str = ""
+    left_out: int = 0
+    broken: int = 0
+    absent: collections.Counter[str] = dataclasses.field(default_factory=collections.Counter)
+    given_up: list[str] = dataclasses.field(default_factory=list)
 
 
 class Book:
@@ -84,6 +93,7 @@ class Book:
                 return key
             if _plain(key) not in self._incomplete:
                 return None
+        self._report.given_up.append(f"{stage.motion} at {stage.force_n:g} N")
         return None
 
     def path(self, key: ContactKey) -> pathlib.Path:
@@ -112,6 +122,10 @@ class Book:
                 _write_picture(self._journals.parent / background_name(key, sensor), picture)
             self._writer.write_contact(found.sequences)
             self._report.contacts += 1
+            self._report.absent.update(found.sequences[0].camera["recording"]["absent"])
+            for told in (sequence.camera["recording"] for sequence in found.sequences):
+                self._report.left_out += told["left_out"]
+                self._report.broken += max(told["broken"].values(), default=0)
             if not found.complete:
                 self._report.incomplete += 1
                 self._incomplete.append(_plain(key))

@@ -20,6 +20,9 @@ _MOVING = {
 }
 
 
+_REST_S = 1.0  # of free motion, whose first pictures are taken for the gel at rest
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ContactStage:
     """One contact of the protocol: its motion, the normal force it is made at, and which force level that is."""
@@ -207,8 +210,9 @@ class FreeCoach:
         """Take one moment into account; `force_n` is shown only."""
         self._start_ns = time_ns if self._start_ns is None else self._start_ns
         left_s = self._seconds - (time_ns - self._start_ns) / NS_PER_S
+        at_first = "; touch nothing yet, for the gel at rest" if left_s > self._seconds - _REST_S else ""
         return Advice(
-            prompt=f"free motion: {max(0.0, left_s):.0f} s left",
+            prompt=f"free motion: {max(0.0, left_s):.0f} s left{at_first}",
             phase=Phase.APPROACH,
             recording=left_s > 0,
             done=left_s <= 0,

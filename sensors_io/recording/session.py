@@ -20,6 +20,7 @@ from sensors_io.devices.base import Sample
 from sensors_io.devices.errors import DeviceError, StreamEndedError
 from sensors_io.devices.intake import Counts
 from sensors_io.force import ForceError, GravityModel, Mount
+from sensors_io.index import JOURNALS
 from sensors_io.recording.book import Book, ObjectView, Report
 from sensors_io.recording.coach import Advice, Coach, CoachConfig, ContactStage, FreeCoach, protocol
 from sensors_io.recording.journal import JournalWriter
@@ -27,7 +28,6 @@ from sensors_io.recording.streams import SampleReader, Stream, StreamStatus
 from sensors_io.records import RecordsMeta, RecordWriter
 from sensors_io.schema import ContactKey, Phase, SchemaError
 
-_JOURNALS = ".journals"
 _UNTOUCHED_S = 10.0  # of a pause before the first touch the last 10 to 20 s are kept: contacts are stored from memory
 _IDLE_S = 0.002  # between looks at the devices; a tenth of the fastest camera's period
 
@@ -111,7 +111,7 @@ def record_session(
     streams = tuple(Stream(i, feed, config.late_s.get(feed.identity.sensor, 0.0)) for i, feed in enumerate(tactile))
     report = Report()
     with RecordWriter(out, meta=_meta(config, streams), resume=True) as writer:
-        journals = out / _JOURNALS
+        journals = out / JOURNALS
         journals.mkdir(exist_ok=True)
         book = Book(writer, journals, report)
         book.add_object(config.object_id, view)

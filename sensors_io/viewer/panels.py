@@ -86,8 +86,8 @@ def arrows(field_mm: np.ndarray, top_mm: float = _SHIFT_TOP_MM) -> np.ndarray:
 
 
 def with_rule(picture: np.ndarray, width_mm: float | None) -> np.ndarray:
-    """The picture, enlarged if it is small, with a scale in millimetres; as it is where its width is not known."""
-    if width_mm is None:
+    """The picture, enlarged if it is small, with a scale in millimetres if its width is known and not too small."""
+    if width_mm is None or width_mm < _RULES_MM[0]:
         return picture
     picture = _enlarged(picture)
     length_mm = max((mm for mm in _RULES_MM if 3 * mm <= width_mm), default=_RULES_MM[0])

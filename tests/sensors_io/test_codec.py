@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import pathlib
+import tracemalloc
 import zlib
 
 import hypothesis
@@ -35,6 +36,16 @@ def test_a_sequence_comes_back(sensor):
             assert getattr(after, name) is None
         else:
             np.testing.assert_allclose(getattr(after, name), getattr(before, name), rtol=0, atol=tolerance)
+
+
+def test_encoding_takes_the_memory_of_the_entry_and_of_its_differences():
+    frames = np.random.default_rng(0).integers(0, 255, (8, 200, 200, 3), np.uint8)
+    before = dataclasses.replace(sequence(0, length=8), frames=frames.cumsum(0, np.uint8))
+    tracemalloc.start()
+    codec.encode_sequence(before)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2.5 * frames.nbytes
 
 
 def test_a_card_comes_back_exactly():

@@ -20,7 +20,7 @@ from sensors_io.commands.console import ERR, OUT
 from sensors_io.importers.pictures import read_picture
 from sensors_io.records import RecordWriter
 from tests.sensors_io import fakes
-from tests.sensors_io.importers.films import entry, folder
+from tests.sensors_io.importers.films import entry, folder, picture
 
 GELSLAM = pathlib.Path(__file__).resolve().parents[1] / "data" / "gelslam"
 LAYOUTS = "octopi touch-and-go tvl tacquad feelanyforce ycb-slide tac3d estimate-modulus"
@@ -73,6 +73,26 @@ def test_check_counts_flags_and_verifies(run, tmp_path):
     assert status == 1
     assert "CorruptRecordsError" in err
     assert "contacts-00001.arrayrecord" in err
+
+
+def test_what_a_recording_leaves_out_is_told_and_checked(run, tmp_path):
+    """A camera that is plugged in again comes back with its own size; a killed session leaves a journal."""
+    for n in range(12):
+        picture(tmp_path / "shots" / f"{n}.png", shape=(10, 32) if n < 4 else (24, 32))
+    out = tmp_path / "records"
+    (out / ".journals").mkdir(parents=True)
+    _, _, err = run("list", out)
+    assert "has no index.json: give the directory of a data set, or write one there first (a recording was" in err
+    words = ["record", "--out", out, "--object-id", "cup", "--free-s", "0.4"]
+    status, told, _ = run(*words, "replay", "--path", tmp_path / "shots", "--seconds", "5")
+    assert status == 0
+    assert "4 frames were left out: their size" in told
+    _, told, _ = run("check", out)
+    assert re.search(r"frame recorded in another size.* 4 ", told)
+    (out / ".journals" / "cup-1-free-0.journal").touch()
+    status, _, err = run("check", out)
+    assert status == 1
+    assert "holds 1 contacts that are not in the records" in err
 
 
 def test_generate_hands_its_options_on(run, tmp_path, monkeypatch):

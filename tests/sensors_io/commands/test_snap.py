@@ -9,7 +9,9 @@ from sensors_io.__main__ import main
 from sensors_io.calibration.guide import Guidance, GuideConfig, PressGuide
 from sensors_io.calibration.presses import BallPresses
 from sensors_io.commands.snap import Snap, _write
-from sensors_io.devices.replay import ReplayConfig
+from sensors_io.devices.base import Sample
+from sensors_io.devices.errors import DeviceDataError
+from sensors_io.devices.replay import Replay, ReplayConfig
 from sensors_io.fields.sources import read_picture
 from sensors_io.fields.types import CalibrationError
 from sensors_io.locks import write_lock
@@ -111,6 +113,25 @@ def test_a_session_that_takes_too_little_or_spoils_records_fails(tmp_path, press
     assert main(["snap", *words, "replay", "--path", "shots"]) == 1
     assert said in capsys.readouterr().err
     assert not (tmp_path / "records" / "presses").exists()
+
+
+def test_a_broken_sample_is_counted_and_ends_no_session(tmp_path, presses, capsys, monkeypatch):
+    """Nor does a picture of another size while the gel at rest is looked at."""
+    for n, size in enumerate((None, -2, None)):
+        _write(tmp_path / "shots" / f"{n}.png", presses.background[:size])
+    reads, read = iter(range(9)), Replay.read
+
+    def flaky(replay: Replay, timeout_s: float) -> Sample:
+        if next(reads) == 1:
+            raise DeviceDataError("a message is cut off")
+        return read(replay, timeout_s)
+
+    monkeypatch.setattr(Replay, "read", flaky)
+    words = ["--out", str(tmp_path / "out"), "--ball-diameter-mm", "4", "--mm-per-px", "0.1", "--port", "0"]
+    assert main(["snap", *words, "replay", "--path", str(tmp_path / "shots")]) == 1
+    told = capsys.readouterr()
+    assert "1 broken samples were left out" in told.out
+    assert "has been replayed to its end" in told.err
 
 
 def test_two_sessions_do_not_take_their_pictures_into_one_folder(tmp_path, presses, capsys):

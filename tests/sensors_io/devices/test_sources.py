@@ -13,6 +13,7 @@ from sensors_io.devices.replay import Disconnect, Faults, ReplayConfig
 from sensors_io.devices.scene import SceneDeviceConfig
 from sensors_io.devices.scene_source import SceneSource
 from sensors_io.devices.sources import RecordedContact, VideoFile, frame_numbers
+from sensors_io.records import RecordWriter
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import Flag
 from tests.sensors_io import fakes as records
@@ -51,6 +52,17 @@ def test_a_contact_of_records_with_all_of_its_arrays(tmp_path):
     np.testing.assert_allclose(samples[5].arrays["force_n"], made.force_n[5], atol=1e-3)
     with pytest.raises(DeviceNotFoundError, match="not 'dmtac'"):
         ReplayConfig(path=tmp_path, sensor="dmtac").open(JumpingClock()).__enter__().read(1.0)
+
+
+def test_records_without_rising_times_are_replayed_at_once_or_named(tmp_path):
+    for name, time_ns in (("still", np.zeros(12, np.int64)), ("back", -np.arange(12))):
+        with RecordWriter(tmp_path / name, meta=records.META) as writer:
+            writer.write_object(records.card())
+            writer.write_contact([records.sequence(host_time_ns=time_ns)])
+    device = ReplayConfig(path=tmp_path / "still").open(JumpingClock())
+    assert (len(everything(device)), device.identity.period_s) == (12, None)
+    back = RecordedContact(path=tmp_path / "back")
+    refused(DeviceNotFoundError, "the times of contact 0 run backwards", lambda: back.identity)
 
 
 def test_gaps_of_records_stay_gaps(tmp_path):

@@ -95,6 +95,15 @@ def test_a_rerun_recording_loads_and_has_its_entities(tmp_path, selected):
         assert f"/00001_object_0_press/{name}" in shown
 
 
+def test_a_phase_without_a_name_is_a_number_in_rerun(tmp_path):
+    pytest.importorskip("rerun")
+    with RecordWriter(tmp_path / "records", meta=fakes.META) as writer:
+        writer.write_object(fakes.card())
+        writer.write_contact([fakes.sequence(length=2, phase=np.array([0, 5], np.uint8))])
+    export_rerun(Selected(store=RecordStore(tmp_path / "records")), tmp_path / "a.rrd", SILENT)
+    assert b"phase 5" in (tmp_path / "a.rrd").read_bytes()
+
+
 def recorded_messages(bag: pathlib.Path):
     """Topic, time and message of everything in a bag."""
     typesys = pytest.importorskip("rosbags.typesys")
@@ -121,6 +130,15 @@ def test_a_bag_holds_pictures_depth_force_and_flags_in_the_units_of_ros(tmp_path
     stamp = last["image"].header.stamp
     assert stamp.sec * 10**9 + stamp.nanosec == times[-1] == 2 * sequence.host_time_ns[-1] + 10**9
     assert last["image"].header.frame_id == "gelsight_mini"
+
+
+def test_a_time_beyond_those_of_ros_is_named(tmp_path):
+    pytest.importorskip("rosbags")
+    with RecordWriter(tmp_path / "records", meta=fakes.META) as writer:
+        writer.write_object(fakes.card())
+        writer.write_contact([fakes.sequence(length=2, host_time_ns=np.array([0, 2**62]))])
+    selected = Selected(store=RecordStore(tmp_path / "records"))
+    refused(ExportError, f"a time is {2**62} ns: must be < ", export_rosbag, selected, tmp_path / "bag", SILENT)
 
 
 class FakeNode:

@@ -1,7 +1,9 @@
 """Tiny videos and pictures, and a labels.json in the layout of PhysiCLeAR."""
 
+import fractions
 import json
 
+import av
 import cv2
 import numpy as np
 
@@ -9,6 +11,7 @@ from sensors_io.importers.catalogue import import_catalogue
 from sensors_io.importers.keep import ImportConfig
 from sensors_io.records import RecordStore
 
+MS = fractions.Fraction(1, 1000)
 EVERYTHING = ImportConfig(height=0, max_frames=0, val_share=0, test_share=0)
 
 
@@ -25,6 +28,25 @@ def film(path, frames=12, size=(24, 32), rate=25.0):
         image[:8, :8] = (0, 0, 255)
         writer.write(image)
     writer.release()
+    return path
+
+
+def uneven_film(path, times_ms, sound_s=0.0):
+    """A video of 32 × 24 px whose frames have these times, with sound of so many seconds."""
+    with av.open(str(path), "w") as out:
+        stream = out.add_stream("mpeg4", rate=30)
+        stream.width, stream.height, stream.pix_fmt, stream.codec_context.time_base = 32, 24, "yuv420p", MS
+        sound = out.add_stream("aac", rate=48_000) if sound_s else None
+        for time_ms in times_ms:
+            frame = av.VideoFrame.from_ndarray(np.full((24, 32, 3), 90, np.uint8))
+            frame.pts, frame.time_base = time_ms, MS
+            out.mux(stream.encode(frame))
+        out.mux(stream.encode())
+        if sound is not None:
+            quiet = av.AudioFrame.from_ndarray(np.zeros((1, round(sound_s * 48_000)), np.float32), "fltp", "mono")
+            quiet.sample_rate = 48_000
+            out.mux(sound.encode(quiet))
+            out.mux(sound.encode())
     return path
 
 

@@ -36,6 +36,14 @@ def test_colours_are_rgb_and_a_picture_that_was_cut_off_is_refused(tmp_path, nam
         refused(PictureError, "holds uint16: must hold 8 bits", read_picture, path)
 
 
+def test_a_stack_of_pictures_is_not_its_first_one(tmp_path):
+    pages = [np.full((24, 32, 3), 20 * n, np.uint8) for n in range(3)]
+    cv2.imwritemulti(str(tmp_path / "a.tif"), pages)
+    refused(PictureError, "holds 3 pictures: must hold one", read_picture, tmp_path / "a.tif")
+    cv2.imwritemulti(str(tmp_path / "a.tif"), [pages[1], pages[2][::4, ::4]])  # a preview
+    assert read_picture(tmp_path / "a.tif").max() == 20
+
+
 def test_lost_pictures_are_named_and_mark_the_frame_behind_them(tmp_path):
     paths = [picture(tmp_path / "f" / f"{n}.png", 20 * n) for n in range(6)]
     cut(paths[1])
@@ -46,6 +54,10 @@ def test_lost_pictures_are_named_and_mark_the_frame_behind_them(tmp_path):
     assert pictures.after_loss().tolist() == [False, True, True]
     assert [skip.name for skip in pictures.left_out] == ["f/1.png", "f/2.png", "f/4.png"]
     np.testing.assert_array_equal(pictures.frames[:, 20, 20, 0], [0, 60, 100])
+    picture(paths[0], shape=(10, 32))  # a preview ahead of the others
+    pictures = read_pictures([paths[0], paths[3], paths[5]], np.arange(3), WHOLE)
+    assert pictures.index.tolist() == [1, 2]
+    assert [skip.reason for skip in pictures.left_out] == ["has (10, 32) pixels, most have (24, 32)"]
 
 
 def test_pictures_are_shrunk_and_chosen_by_position(tmp_path):
@@ -61,6 +73,11 @@ def test_names_are_ordered_by_their_numbers(tmp_path):
         (tmp_path / name).touch()
     assert [path.name for path in numbered(tmp_path)] == ["frame_9.png", "frame_10.png", "frame_100.png"]
     assert numbered(tmp_path / "absent") == []
+    for name in ("b3/shot (2).png", "b3/shot.png", "b4/1.5.png", "b4/1.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    ordered = [path.name for folder in ("b3", "b4") for path in numbered(tmp_path / folder)]
+    assert ordered == ["shot.png", "shot (2).png", "1.png", "1.5.png"]
     (tmp_path / "a2").mkdir()
     for name in ("a2/0.2.png", "a2/0.15.png"):
         (tmp_path / name).touch()
@@ -69,7 +86,20 @@ def test_names_are_ordered_by_their_numbers(tmp_path):
     (tmp_path / "a10").mkdir()
     (tmp_path / "a10" / "1.png").touch()
     names = [path.relative_to(tmp_path).as_posix() for path in below(tmp_path, {".png"})]
-    assert names[2:] == ["frame_100.png", "a2/0.15.png", "a2/0.20.png", "a10/1.png"]
+    assert names[2:6] == ["frame_100.png", "a2/0.15.png", "a2/0.20.png", "a10/1.png"]
+
+
+def test_links_are_followed_and_hidden_names_are_left_alone(tmp_path):
+    """macOS writes ._1.png beside 1.png on the disks of others, and a disk keeps what was deleted in .Trashes."""
+    folder = tmp_path / "clips"
+    for name in ("1.png", "._1.png", ".Trashes/2.png", "mug/3.png"):
+        picture(folder / name)
+    (folder / "back").symlink_to(folder)
+    picture(tmp_path / "elsewhere" / "deep" / "4.png")
+    (folder / "linked").symlink_to(tmp_path / "elsewhere")
+    names = [path.relative_to(folder).as_posix() for path in below(folder, {".png"})]
+    assert names == ["1.png", "linked/deep/4.png", "mug/3.png"]
+    assert [path.name for path in numbered(folder)] == ["1.png"]
     refused(UnreadableError, "reach 3.33e\\+37, which 64 bits", nominal_ns, np.array([1, 10**30]), 30.0)
     assert natural(tmp_path / "a2b") < natural(tmp_path / "a10b")
     assert natural(tmp_path / "a٢b") < natural(tmp_path / "a10b") < natural(tmp_path / "a10²1")

@@ -6,10 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
+from sensors_io.devices.sources import VideoFile
 from sensors_io.importers.keep import Keep
 from sensors_io.importers.video import VideoError, read_video
 from tests.sensors_io.checks import refused
-from tests.sensors_io.importers.films import cut, film
+from tests.sensors_io.importers.films import cut, film, uneven_film
 
 WHOLE = {"height": 0, "stride": 1, "max_frames": 0}
 
@@ -54,6 +55,30 @@ def test_shrinking_keeps_the_aspect_ratio_and_takes_area_means(tmp_path):
 def test_a_film_cut_short_is_named(tmp_path):
     said = r"is cut off: \d+ of 40 frames|holds no frame|does not open"
     refused(VideoError, said, read_video, cut(film(tmp_path / "a.avi", 40)), Keep(**WHOLE))
+
+
+UNEVEN_MS = [*range(0, 660, 33), *range(660, 2660, 100), *range(2660, 3060, 20)]
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.mkv"])
+@pytest.mark.parametrize("replay", [False, True])
+def test_a_video_of_uneven_times_is_whole_and_keeps_them(tmp_path, name, replay):
+    """Phones and recorders of screens write them; Matroska states no number of frames."""
+    path = uneven_film(tmp_path / name, UNEVEN_MS)
+    if replay:
+        times_ns = [sample.time_ns for sample in VideoFile(path=path).samples()]
+    else:
+        times_ns = read_video(path, Keep(**WHOLE)).time_ns
+    np.testing.assert_array_equal(times_ns, np.array(UNEVEN_MS) * 1_000_000)
+
+
+@pytest.mark.parametrize(("sound_s", "whole"), [(2.1, True), (2.8, False)])
+def test_sound_may_last_a_little_longer(tmp_path, sound_s, whole):
+    path = uneven_film(tmp_path / "a.mkv", range(0, 2000, 40), sound_s)
+    if whole:
+        assert read_video(path, Keep(**WHOLE)).total == 50
+    else:
+        refused(VideoError, "is cut off, or its sound is longer", read_video, path, Keep(**WHOLE))
 
 
 def test_a_long_video_takes_the_memory_of_the_frames_that_are_kept(tmp_path):

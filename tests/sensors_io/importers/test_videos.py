@@ -34,6 +34,8 @@ def clips(tmp_path):
         picture(root / "sponge" / f"frame_{n}.png", level=10 * n)
     (root / "notes.txt").write_text("no clip")
     (root / "mug" / "3.wmv").write_text("of a kind that is not read")
+    (root / "gone.mp4").symlink_to(root / "absent.mp4")
+    (root / "._cube.avi").write_text("what macOS writes beside cube.avi")
     return root
 
 
@@ -52,7 +54,8 @@ def test_clips_become_records_with_the_labels_of_their_table(clips, tmp_path):
     assert store.objects["sponge"].labels == {"hardness": 0, "material": MATERIALS.index("other")}
     assert (store.objects["cube"].split, store.objects["cube"].annotator) == ("train", "me")
     assert sorted(store.objects[name].split for name in ("mug", "sponge", "towel")) == ["test", "train", "val"]
-    assert [skip.name for skip in report.skipped] == ["other.avi", "mug/3.wmv"]
+    assert [skip.name for skip in report.skipped] == ["other.avi", "gone.mp4", "mug/3.wmv"]
+    assert report.skipped[1].reason == "is a link to nothing"
     at = next(i for i, key in enumerate(store.contacts) if key.object_id == "sponge")
     frames = store.contact(at)["gelsight_mini"].frames
     assert [int(frame[-1, -1, 0]) for frame in frames] == [90, 100, 110]

@@ -1,5 +1,7 @@
 """A journal cut off anywhere is readable up to there; one damaged inside is refused."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -22,6 +24,18 @@ def test_entries_come_back(journal):
     assert [e.plain["n"] for e in entries] == [0, 1, 2, 3]
     assert entries[2].arrays["frame"].tolist() == [[2] * 3] * 2
     assert entries[2].arrays["empty"].shape == (0, 3)
+
+
+def test_a_long_journal_is_not_held_in_memory(tmp_path):
+    with JournalWriter(tmp_path / "a.journal") as writer:
+        for _ in range(40):
+            writer.append("frame", {}, frame=np.zeros((200, 200, 3), np.uint8))
+    tracemalloc.start()
+    entries, _ = read_journal(tmp_path / "a.journal")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(entries) == 40
+    assert peak < 1e6
 
 
 def test_every_cut_keeps_all_whole_entries(journal):

@@ -68,6 +68,13 @@ def test_a_contact_let_go_too_early_is_kept_and_asked_for_again(tmp_path):
     assert session(tmp_path, Hand(), SHORT).contacts == 0
 
 
+def test_a_stage_that_no_attempt_completes_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr("sensors_io.recording.book.ATTEMPTS", 2)
+    report = session(tmp_path, Hand(slips_at=(1, 2)), SHORT)
+    assert (report.contacts, report.incomplete, report.given_up) == (3, 2, ["slide_x at 2 N"])
+    assert session(tmp_path, Hand(), SHORT).given_up == ["slide_x at 2 N"]
+
+
 def test_free_motion_alone_needs_no_force_sensor(tmp_path):
     hand = Hand()
     said = "gelsight_mini tells no force.*--free-s 10"
@@ -76,6 +83,7 @@ def test_free_motion_alone_needs_no_force_sensor(tmp_path):
     assert record_session(tmp_path, config, [Camera(hand)], None, show=hand.show).contacts == 1
     made = RecordStore(tmp_path).contact(0)["gelsight_mini"]
     assert (made.key.motion, len(made), made.force_n) == ("free", 51, None)
+    assert hand.statuses[0].advice.prompt.endswith("s left; touch nothing yet, for the gel at rest")
 
 
 CHILD = """
@@ -147,6 +155,16 @@ def test_two_sensors_make_one_contact_on_one_clock(tmp_path):
     as_stamped = both(tmp_path / "as stamped")[1].contact(0)
     first = [s.host_time_ns[np.argmax(-s.force_n[:, 2] > 0.25)] for s in as_stamped.values()]
     assert first[1] - first[0] == 30 * MS
+
+
+def test_a_sensor_that_gives_nothing_is_told(tmp_path):
+    class Silent(Camera):
+        def drain(self):
+            return []
+
+    hand = Hand()
+    report = record_session(tmp_path, SHORT, [Camera(hand), Silent(hand, "digit")], Scale(hand), show=hand.show)
+    assert (report.contacts, report.absent) == (2, {"digit": 2})
 
 
 def test_the_gel_at_rest_and_the_object_are_kept(tmp_path):
