@@ -123,9 +123,9 @@ class Book:
             self._writer.write_contact(found.sequences)
             self._report.contacts += 1
             self._report.absent.update(found.sequences[0].camera["recording"]["absent"])
-            for told in (sequence.camera["recording"] for sequence in found.sequences):
-                self._report.left_out += told["left_out"]
-                self._report.broken += max(told["broken"].values(), default=0)
+            for recording in (sequence.camera["recording"] for sequence in found.sequences):
+                self._report.left_out += recording["left_out"]
+                self._report.broken += max(recording["broken"].values(), default=0)
             if not found.complete:
                 self._report.incomplete += 1
                 self._incomplete.append(_plain(key))
