@@ -24,6 +24,7 @@ from experiments.core.artifacts import (
     write_arrays,
     write_sealed,
 )
+from experiments.core.errors import ConfigurationError
 from experiments.core.metric_log import MetricLog, damaged_log, read_metrics, summary
 from experiments.core.progress import Advance, Loop, ProgressCallback, TrainingSample, Watcher, show_progress
 from experiments.core.stopping import Stopping
@@ -255,6 +256,19 @@ class Context:
         if not self.done(stage):
             self.save_stage(stage, compute())
         return self.load_stage(stage)
+
+    def require_same(self, stage: str, here: Any, what: str) -> None:
+        """Refuse to continue with another input than the run began with, of which `here` is a digest.
+
+        A run goes on from policies and answers that were made with the input that it had then.
+
+        Raises:
+          ConfigurationError: naming `what`.
+        """
+        if self.once(stage, lambda: here) != here:
+            raise ConfigurationError(
+                f"{what} changed since this run began: put back what was there, or start a new run with --fresh"
+            )
 
     def cached_arrays(
         self, name: str, make: Callable[[], Mapping[str, Any]], *, compressed: bool = False
