@@ -338,6 +338,8 @@ def _announce(directory: Path, resumed: bool) -> None:
     began, now = runs.Revision(**description["git"]), runs.revision()
     if began != now:
         print_lines(f"note: this run began at {began}, the code is now at {now}")
+    elif description.get("source", runs.code_digest()) != runs.code_digest():  # changes that no commit holds
+        print_lines(f"note: source files changed since this run began; the commit is still {now}")
     for field, here in (("versions", runs.versions()), ("machine", numerics.machine())):
         before = {name: description.get(field, {}).get(name, value) for name, value in here.items()}
         for change in numerics.changed(before, here):

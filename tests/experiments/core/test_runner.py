@@ -91,8 +91,11 @@ def test_a_crashed_run_is_continued_to_the_same_files(monkeypatch, capsys):
     with pytest.raises(RuntimeError, match="rolled away"):
         run(*arguments)
     monkeypatch.delenv("COIN_CRASHES")
+    monkeypatch.setattr(runs, "code_digest", lambda: "of other files")
     assert run(*arguments) == 0
-    assert "continuing runs/coin" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "continuing runs/coin" in said
+    assert "note: source files changed since this run began; the commit is still" in said
     assert run(*arguments) == 0  # the first is finished, so this one is new
     assert "new run" in capsys.readouterr().out
     continued, straight = directories()
