@@ -375,6 +375,7 @@ def _compute(
         with contextlib.closing(context), context.timed("total"), page.kept_fresh():
             context.require_log()
             results = experiment.run(command.config, context)
+            context.require_in_place()
         tables = (*results.tables, *left_out_tables(read_metrics(directory)))
         timing, drawn = {**context.timing(), **results.timing}, {**experiment.curves, **results.curves}
         results = dataclasses.replace(results, timing=timing, tables=tables, curves=drawn)
