@@ -295,7 +295,7 @@ def require_growth(folder: Path, name: str, units: Sequence[SweepUnit]) -> None:
 
 
 def _other_code(run: runs.PastRun) -> str:
-    """How to compute a finished run again, where the source files were others then."""
+    """Words about a finished run that other source files made; none where they are the same."""
     same = run.description.get("source", runs.code_digest()) == runs.code_digest()
     return "" if same else f"; other source files made it (code {run.code}): move it away to run it again"
 
