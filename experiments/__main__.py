@@ -63,6 +63,12 @@ def main() -> None:
     except OSError as error:  # a folder that cannot be read or written, a full disk, a pipe that was closed
         say(f"{type(error).__name__}: {error}: correct the path, its permissions, or free some space")
         status = 1
+    except ValueError as error:
+        if "jax" in sys.modules:
+            raise
+        # its import ended, which reads them
+        say(f"ValueError: {error}: a variable of the environment that begins with JAX_; correct it, or unset it")
+        status = 2
     leave(status)
 
 

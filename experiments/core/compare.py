@@ -67,7 +67,8 @@ def compare_runs(runs: Sequence[PastRun], most: int) -> str:
             "compare runs of one experiment"
         )
     settings = [{"scale": r.description["scale"]} | r.description["config"] for r in runs]
-    code = [{"code": r.code} | r.description.get("versions", {}) | r.description.get("machine", {}) for r in runs]
+    source = lambda run: {"code": run.code, "source": run.description.get("source", ABSENT)}
+    code = [source(r) | r.description.get("versions", {}) | r.description.get("machine", {}) for r in runs]
     cost = (
         f"{name} {ABSENT if run.seconds is None else duration(run.seconds)}"
         for name, run in zip(names, runs, strict=True)

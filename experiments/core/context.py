@@ -24,6 +24,7 @@ from experiments.core.artifacts import (
     write_arrays,
     write_sealed,
 )
+from experiments.core.errors import ConfigurationError
 from experiments.core.metric_log import MetricLog, damaged_log, read_metrics, summary
 from experiments.core.progress import Advance, Loop, ProgressCallback, TrainingSample, Watcher, show_progress
 from experiments.core.stopping import Stopping
@@ -132,6 +133,11 @@ class Context:
                 how = f"of the {number} lines of stage {stage} some are missing or changed"
                 raise damaged_log(self.directory / "metrics.jsonl", how)
 
+    def require_in_place(self) -> None:
+        """`UnwrittenError` if the run was moved or removed while it goes on: its other half would lie elsewhere."""
+        if self._log is not None:
+            self._log.require_in_place()
+
     def sort_log(self) -> None:
         """Put the lines of the log in the order of the seeds, as if one had been trained after the other."""
         if self._log is not None:
@@ -219,6 +225,7 @@ class Context:
 
     def checkpoint_dir(self, stage: str) -> Path:
         """The directory of a stage's checkpoints, created."""
+        self.require_in_place()
         path = (self.directory / "checkpoints" / _checked(stage)).absolute()
         try:
             path.mkdir(parents=True, exist_ok=True)
@@ -240,6 +247,7 @@ class Context:
 
     def save_stage(self, stage: str, result: Any) -> None:
         """Write the result of a finished stage as JSON, which marks the stage as done."""
+        self.require_in_place()
         content = {"stage": stage, "result": result}
         self.processes.write_once(lambda: write_sealed(self._stage_file(stage), content))
 
@@ -255,6 +263,19 @@ class Context:
         if not self.done(stage):
             self.save_stage(stage, compute())
         return self.load_stage(stage)
+
+    def require_same(self, stage: str, here: Any, what: str) -> None:
+        """Refuse to continue with another input than the run began with, of which `here` is a digest.
+
+        A run goes on from policies and answers that were made with the input that it had then.
+
+        Raises:
+          ConfigurationError: naming `what`.
+        """
+        if self.once(stage, lambda: here) != here:
+            raise ConfigurationError(
+                f"{what} changed since this run began: put back what was there, or start a new run with --fresh"
+            )
 
     def cached_arrays(
         self, name: str, make: Callable[[], Mapping[str, Any]], *, compressed: bool = False
@@ -280,7 +301,7 @@ class Context:
 
     def add_time(self, name: str, seconds: float) -> None:
         """Add to the wall time under a name in `timing`."""
-        if self.processes.writes:
+        if self.processes.writes and self.directory.is_dir():  # else it was moved, and none must take its place
             with self._lock:
                 kept = self.timing()
                 write_sealed(self._timing_file, kept | {name: kept.get(name, 0.0) + seconds})

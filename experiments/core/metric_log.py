@@ -67,6 +67,7 @@ class MetricLog:
             raise ValueError(f"scalars holds {sorted(taken)}: these are fields of every line; rename them")
         values = jsonable(scalars, where=f"{stage} step {step}")
         with self._lock:
+            self.require_in_place()
             if stage not in self._seen:
                 self.rewind(stage, step)
             with self._named():
@@ -74,6 +75,13 @@ class MetricLog:
                 self._file.flush()
             for watcher in self._watchers:
                 watcher.logged(stage, step, values)
+
+    def require_in_place(self) -> None:
+        """`UnwrittenError` if the file was moved or removed, as with its run: the rest would lie elsewhere."""
+        with self._lock:
+            here = self._path.exists() and os.path.samestat(os.fstat(self._file.fileno()), self._path.stat())
+        if not here:
+            raise UnwrittenError(f"{self._path} was moved or removed while its run goes on: put it back, then continue")
 
     def close(self) -> None:
         """Flush the file to the disk and close it."""

@@ -338,6 +338,8 @@ def _announce(directory: Path, resumed: bool) -> None:
     began, now = runs.Revision(**description["git"]), runs.revision()
     if began != now:
         print_lines(f"note: this run began at {began}, the code is now at {now}")
+    elif description.get("source", runs.code_digest()) != runs.code_digest():  # changes that no commit holds
+        print_lines(f"note: source files changed since this run began; the commit is still {now}")
     for field, here in (("versions", runs.versions()), ("machine", numerics.machine())):
         before = {name: description.get(field, {}).get(name, value) for name, value in here.items()}
         for change in numerics.changed(before, here):
@@ -373,6 +375,7 @@ def _compute(
         with contextlib.closing(context), context.timed("total"), page.kept_fresh():
             context.require_log()
             results = experiment.run(command.config, context)
+            context.require_in_place()
         tables = (*results.tables, *left_out_tables(read_metrics(directory)))
         timing, drawn = {**context.timing(), **results.timing}, {**experiment.curves, **results.curves}
         results = dataclasses.replace(results, timing=timing, tables=tables, curves=drawn)

@@ -112,6 +112,7 @@ def describe(
         "scale": scale,
         "config": config,
         "git": dataclasses.asdict(revision()),
+        "source": code_digest(),
         "versions": versions(),
         "settings": settings,
         "machine": {"system": platform.system(), "machine": platform.machine(), "cpus": os.cpu_count(), **devices},

@@ -209,7 +209,7 @@ def run_sweep(
     for i, unit in enumerate(units):
         past, title = unit.run, _title_of(unit)
         if past is not None and past.state == "finished":
-            print_lines(f"{i + 1} of {len(units)}, {title}: finished before, {past.directory}")
+            print_lines(f"{i + 1} of {len(units)}, {title}: finished before, {past.directory}{_other_code(past)}")
             continue
         print_lines(f"{i + 1} of {len(units)}, {title}")
         try:
@@ -292,6 +292,12 @@ def require_growth(folder: Path, name: str, units: Sequence[SweepUnit]) -> None:
             f"into is {folder}: its sweep of {lacking[0][0]} has {len(lacking)} runs that this one leaves out, the "
             f"first of {lacking[0][1]}; give all of its values, or another folder by --into"
         )
+
+
+def _other_code(run: runs.PastRun) -> str:
+    """Words about a finished run that other source files made; none where they are the same."""
+    same = run.description.get("source", runs.code_digest()) == runs.code_digest()
+    return "" if same else f"; other source files made it (code {run.code}): move it away to run it again"
 
 
 def _title_of(unit: SweepUnit) -> str:

@@ -157,7 +157,8 @@ class LivePage(Watcher):
             curves={name: drawn for _, phase in self._drawn.values() for name, drawn in phase.items()},
             reload_s=reload_s,
         )
-        write_text(self._directory / "report.html", page)
+        if self._directory.is_dir():  # else the run was moved, and no page must take its place
+            write_text(self._directory / "report.html", page)
 
     def _draw(self) -> None:
         """Draw the curves of each phase; a phase without new lines is not drawn again."""

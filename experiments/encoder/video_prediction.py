@@ -33,6 +33,7 @@ from experiments.core.text import bounds, interval
 from experiments.encoder.pretrain import ClipFeed, StageOneDataConfig, open_touch, padded
 from experiments.study import paper_numbers as paper
 from experiments.study.dataset import Dataset
+from experiments.study.training import require_encoder
 from sensors_io.arrays import load_arrays
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.bench.image_similarity import check_weights, lpips, ssim
@@ -97,6 +98,7 @@ def run(config: VideoPredictionConfig, context: Context) -> Results:
     """Train both predictors, score them and the baselines."""
     data = open_touch(config.touch, config.frames, config.image_px, context)
     rows, test = data.training, data.parts["test"][: config.scored]
+    require_encoder(config.encoder, context)
     start = None if config.encoder is None else load_encoder(config.encoder)
     predictors = {name: train(config, name, data, rows, context, start) for name in (TOUCH, VISION)}
     params = jax.device_get(predictors[TOUCH].params["encoder"] if start is None else start.params)

@@ -25,6 +25,7 @@ from jaxtyping import Bool, Int
 
 from experiments.core.charts import Panel, Rule, Series, draw, estimates
 from experiments.core.context import Context
+from experiments.core.errors import ConfigurationError
 from experiments.core.look import PALETTE, SHARED
 from experiments.core.results import Picture, Requirement, Results, Table, at_least, named_table
 from experiments.core.text import bounds, interval, number
@@ -86,6 +87,11 @@ Contrasts = Mapping[str, AccuracyContrast]
 
 def run(config: StudyConfig, context: Context) -> Results:
     """Train, evaluate with and without touch, contrast."""
+    if config.seeds < 2:
+        raise ConfigurationError(
+            f"seeds is {config.seeds}: must be at least 2, since the policies of other seeds say what a picture "
+            "suggests to one seed; raise it"
+        )
     variants = {**control_variants(FULL), **control_variants(SFT)}
     study = run_full_model(config, context, variants)
     questions = touch_questions(study, study.answers[SFT][0])

@@ -71,14 +71,13 @@ from experiments.study.levels import level_report
 from experiments.study.scores import PUBLISHED, score, score_study, study_results, study_settings
 from experiments.study.stages import StudySFT
 from experiments.study.study import BLIND, CONTINUED, SFT, EvalVariant, check_arms, train_study
-from experiments.study.training import TrainingConfig, open_data, starting_model
+from experiments.study.training import TrainingConfig, open_data, require_encoder, starting_model
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS
 from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.load import WeightsError, load_checkpoint
 from touchr1_jax.models.lora import LoraConfig
-from touchr1_jax.models.pretrained import load_encoder
 from touchr1_jax.models.released_policy import ReleasedModel, ReleasedPolicy, build_released_policy, instruction
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import touch_shapes, with_lora
@@ -243,8 +242,7 @@ def begin(config: TouchR1Config, source: Path, context: Context) -> tuple[Releas
     released.grpo_shape(config, ahead, context.devices.shape)
     if server is not None:
         server.check(with_lora(ahead, config.lora), config.grpo, context.devices)
-    if config.encoder is not None:
-        load_encoder(config.encoder)  # what is no encoder is named before data are made
+    require_encoder(config.encoder, context)
     data = open_data(config, model.view_px, context)
     model, tactile = starting_model(model, config.encoder, data.clip.sensors)
     policy = build_released_policy(model, found, data.clip.sensors)

@@ -32,11 +32,18 @@ from experiments.study.stages import (
     make_arm,
     probe_features,
 )
-from experiments.study.training import DECODER, TrainingConfig, open_data, preset_name, require_derived, starting_model
+from experiments.study.training import (
+    DECODER,
+    TrainingConfig,
+    open_data,
+    preset_name,
+    require_derived,
+    require_encoder,
+    starting_model,
+)
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS
 from sensors_io.units import WorkUnit, finish
-from touchr1_jax.models.pretrained import load_encoder
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.touch_policy import ModelConfig, TouchPolicy, build_policy, check_model, with_lora
 from touchr1_jax.models.vision import VisionConfig
@@ -120,16 +127,14 @@ def run_study(
       variants: further evaluations of SFT, the control and the arms, by the names of their answers.
 
     Raises:
-      ValueError: an algorithm is configured and all arms have their own.
-      ValueError, RewardError, SizeError, EncoderError: as `check_arms`, `check_model` and `load_encoder`.
+      ValueError, RewardError, SizeError, EncoderError: as `check_arms`, `check_model` and `require_encoder`.
     """
     if arms.keys() <= algorithms.keys() and config.grpo.algorithm != Paper():
         given = preset_name(GRPOConfig(algorithm=config.grpo.algorithm))
         raise ValueError(f"grpo.algorithm is {given}: no arm trains by it, for each has its own; leave it out")
     check_arms({arm: {**weights, **config.more_rewards} for arm, weights in arms.items()}, variants)
     check_model(config.model, SENSORS)
-    if config.encoder is not None:
-        load_encoder(config.encoder)  # a file that is no encoder is reported before data are made
+    require_encoder(config.encoder, context)
     data, policy, tactile = _opened(config, context, min(idle_cores(context), config.seeds))
     if not context.launcher.here:
         order = tuple((name, seed) for name in (SFT, BLIND, CONTINUED, *arms) for seed in range(config.seeds))

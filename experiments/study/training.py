@@ -2,6 +2,7 @@
 
 import dataclasses
 import enum
+import hashlib
 import math
 from pathlib import Path
 from typing import Literal, TypeVar
@@ -192,6 +193,19 @@ def open_data(config: TrainingConfig, view_px: int, context: Context, at_once: i
             "one of these names, or add the sensor to `touchr1_jax.text.language`"
         )
     return data
+
+
+def require_encoder(encoder: Path | None, context: Context) -> None:
+    """Refuse, before data are made, a file that is no encoder, or another one than the run began with.
+
+    `runs/pretrain_encoder/latest` is another one after the next run of that experiment.
+
+    Raises:
+      EncoderError, ConfigurationError: naming the file.
+    """
+    if encoder is not None:
+        digest = hashlib.sha256(load_encoder(encoder).to_bytes()).hexdigest()[:16]
+        context.require_same("encoder", digest, f"{encoder}, the encoder,")
 
 
 M = TypeVar("M", bound=TouchConfig)

@@ -7,16 +7,20 @@ Every process runs the same program.  Process 0 alone writes files; the others w
 All must see the same run and cache directories, as over a network file system.
 """
 
+import contextlib
 import dataclasses
 import json
-from collections.abc import Callable
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
-from touchr1_jax.distributed.companions import coordination_apart
+from touchr1_jax.distributed.companions import STDERR, coordination_apart
 from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.distributed.placement import DeviceMesh
 from touchr1_jax.training.loop import SingleDevice
@@ -24,6 +28,9 @@ from touchr1_jax.training.loop import SingleDevice
 GIB = 2**30
 
 MOST_PROCESSES, MOST_PORT = 2**20, 2**16 - 1
+
+SAY_S, WAIT_S = 5.0, 300.0
+"""Seconds after which a process says that it waits for the others of its run, and after which it ends."""
 
 MESSAGE_BYTES = 8192
 """Longest value that process 0 can send to the others: twice Linux's longest path."""
@@ -135,8 +142,48 @@ class ProcessGroup:
 SINGLE_PROCESS = ProcessGroup()
 
 
-def join_processes(launch: Launch) -> ProcessGroup:
+@contextlib.contextmanager
+def _announced(launch: Launch, say_s: float, wait_s: float) -> Iterator[None]:
+    """Say what the block waits for, and in the end that it waits no longer: JAX aborts with a stack of C++ instead.
+
+    Signals end the process at once, since their handlers would run after the block.
+    """
+    at = f"at {launch.coordinator}" if launch.coordinator else "that the cluster names"
+    me = "this process" if launch.process is None else f"process {launch.process} of {launch.processes}"
+
+    def end() -> None:
+        say(
+            f"{ProcessesNotFoundError.__name__}: {me} did not find the other processes {at} within {wait_s:g} s: start "
+            "all of them with the same command and numbers from 0 on, and let them reach this address"
+        )
+        os._exit(1)  # the thread that waits is inside JAX
+
+    waits = f"{me} waits for the other processes of the run {at}, for at most {wait_s:g} s"
+    timers = [threading.Timer(say_s, say, (waits,)), threading.Timer(wait_s, end)]
+    handlers = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    heard = {n: signal.signal(n, signal.SIG_DFL) for n, handler in handlers.items() if callable(handler)}
+    for timer in timers:
+        timer.daemon = True
+        timer.start()
+    try:
+        yield
+    finally:
+        for n, handler in heard.items():
+            signal.signal(n, handler)
+        for timer in timers:
+            timer.cancel()
+
+
+def say(text: str) -> None:
+    """Write a line to standard error, at once: another thread may be inside a print."""
+    with contextlib.suppress(OSError):
+        os.write(STDERR, f"{text}\n".encode())
+
+
+def join_processes(launch: Launch, say_s: float = SAY_S, wait_s: float = WAIT_S) -> ProcessGroup:
     """Join the processes of a run; must come before any computation.
+
+    After `say_s` seconds standard error names what is waited for; after `wait_s` the process ends with status 1.
 
     Raises:
       ProcessesNotFoundError: a distributed run without an address, and no cluster that JAX knows to name one.
@@ -144,8 +191,10 @@ def join_processes(launch: Launch) -> ProcessGroup:
     if not launch.distributed:
         return SINGLE_PROCESS
     try:
-        with coordination_apart():
-            jax.distributed.initialize(launch.coordinator, launch.processes, launch.process)
+        with coordination_apart(), _announced(launch, say_s, wait_s):
+            later = round(2 * wait_s)
+            address = launch.coordinator, launch.processes, launch.process
+            jax.distributed.initialize(*address, initialization_timeout=later)
     except (ValueError, jax.errors.JaxRuntimeError) as error:
         raise ProcessesNotFoundError(
             f"--distributed finds no other processes ({error}): start them with srun, mpirun or as an indexed "

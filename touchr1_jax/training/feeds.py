@@ -96,7 +96,7 @@ def encoded_clips(
         stream_mask = np.asarray(encoded.stream_mask)
         return {"contact": contact[rows[own]], "label": label[rows[own]], "stream_mask": stream_mask, ENCODED: encoded}
 
-    order = grain.MapDataset.range(len(contact)).seed(seed).shuffle().repeat().batch(batch_size)
+    order = grain.MapDataset.range(len(contact)).seed(seed).shuffle().repeat().batch(batch_size, drop_remainder=True)
     return order.map(gather).to_iter_dataset(ONE_AT_A_TIME)
 
 

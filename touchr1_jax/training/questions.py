@@ -40,7 +40,9 @@ class QuestionFeed(Feed):
         evidence: np.ndarray | None = None,
     ) -> None:
         contact, attribute = labelled_questions(label)
-        order = grain.MapDataset.range(len(contact)).seed(seed).shuffle().repeat().batch(batch_size)
+        order = (
+            grain.MapDataset.range(len(contact)).seed(seed).shuffle().repeat().batch(batch_size, drop_remainder=True)
+        )
         super().__init__(order.to_iter_dataset(ONE_AT_A_TIME), seed)
         self._policy, self._features, self._truth = policy, features, label if truth is None else truth
         self._contact, self._attribute, self._full_share = contact, attribute, full_share

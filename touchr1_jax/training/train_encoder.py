@@ -160,6 +160,6 @@ def touch_rows(
       own: rows of a batch that this process reads; all by default.
     """
     own = np.arange(batch_size) if own is None else own
-    order = grain.MapDataset.range(len(rows)).seed(seed).shuffle().repeat().batch(batch_size)
+    order = grain.MapDataset.range(len(rows)).seed(seed).shuffle().repeat().batch(batch_size, drop_remainder=True)
     batches = order.map(lambda at: jax.tree.map(lambda x: x[rows[at[own]]], touch))
     return iter(batches.to_iter_dataset(ONE_AT_A_TIME))

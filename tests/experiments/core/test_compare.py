@@ -94,8 +94,15 @@ def stamps(home: Path) -> list[str]:
 @pytest.mark.long
 def test_two_runs_of_one_experiment(home, capsys):
     first, second = stamps(home)
-    assert main(["compare", f"coin/{first}", f"coin/{second}", "--runs-dir", str(home)], package=FAKES) == 0
+    arguments = ["compare", f"coin/{first}", f"coin/{second}", "--runs-dir", str(home)]
+    assert main(arguments, package=FAKES) == 0
     out = capsys.readouterr().out
+    path = home / "coin" / second / "config.json"
+    whole = path.read_text()
+    write_sealed(path, read_json(path) | {"source": "of uncommitted changes"})
+    assert main(arguments, package=FAKES) == 0
+    path.write_text(whole)
+    assert "of uncommitted changes" in capsys.readouterr().out
     assert f"A  coin  {first}  smoke" in out
     assert "toss.bias  0.5  0.25" in out
     assert "Different code or machine: nothing" in out

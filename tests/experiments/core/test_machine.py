@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -84,6 +85,24 @@ def test_one_process_asks_no_other(monkeypatch):
     assert SINGLE_PROCESS.any(True)
     assert not SINGLE_PROCESS.any(False)
     assert SINGLE_PROCESS.split_work(np.arange(3), lambda rows: rows + 1).tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize("process", [0, 1])
+def test_processes_that_nobody_joins_say_so_and_end(process):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+    launch = f"Launch(distributed=True, coordinator={address!r}, processes=2, process={process})"
+    code = f"from touchr1_jax.distributed.processes import *; join_processes({launch}, say_s=0.1, wait_s=%s)"
+    done = subprocess.run([sys.executable, "-c", code % 0.5], capture_output=True, text=True, check=False)
+    me = f"process {process} of 2"
+    waits, ends = [line for line in done.stderr.splitlines() if me in line]
+    assert waits == f"{me} waits for the other processes of the run at {address}, for at most 0.5 s"
+    assert ends.startswith(f"ProcessesNotFoundError: {me} did not find the other processes at {address} within 0.5 s: ")
+    assert done.returncode == 1
+    with subprocess.Popen([sys.executable, "-c", code % 60], stderr=subprocess.PIPE) as waiting:
+        waiting.stderr.readline()
+        waiting.send_signal(signal.SIGINT)
+        assert waiting.wait(20) == -signal.SIGINT
 
 
 def test_the_parts_of_all_processes_are_what_one_makes(monkeypatch):

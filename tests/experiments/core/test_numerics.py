@@ -90,3 +90,11 @@ def test_settings_that_no_experiment_runs_with_are_refused(tmp_path, capsys, nam
         jax.config.update(name, False)
     assert f"{name} is True: must be False" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_variable_that_jax_cannot_read_is_named():
+    order, env = [sys.executable, "-m", "experiments", "ablation_ordinal"], os.environ | {"JAX_ENABLE_X64": "maybe"}
+    done = subprocess.run(order, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "'maybe' for environment 'JAX_ENABLE_X64': a variable" in done.stderr
+    assert "Traceback" not in done.stderr

@@ -91,8 +91,11 @@ def test_a_crashed_run_is_continued_to_the_same_files(monkeypatch, capsys):
     with pytest.raises(RuntimeError, match="rolled away"):
         run(*arguments)
     monkeypatch.delenv("COIN_CRASHES")
+    monkeypatch.setattr(runs, "code_digest", lambda: "of other files")
     assert run(*arguments) == 0
-    assert "continuing runs/coin" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "continuing runs/coin" in said
+    assert "note: source files changed since this run began; the commit is still" in said
     assert run(*arguments) == 0  # the first is finished, so this one is new
     assert "new run" in capsys.readouterr().out
     continued, straight = directories()
@@ -168,6 +171,26 @@ def test_options_of_a_choice_stand_anywhere(arguments, expected):
 def test_the_scale_chooses_the_defaults_that_overrides_change(arguments, scale, steps):
     command = parse(coin.EXPERIMENT, arguments, "about")
     assert (command.scale, command.config.steps) == (scale, steps)
+
+
+def test_a_run_that_is_moved_while_it_goes_on_ends_and_is_whole_once_it_is_back(monkeypatch, capsys):
+    train, aside = coin.train, Path("runs/coin/mine")
+
+    def moving(config, context, arm, seed):
+        if (arm, seed) == ("unpaid", 1):
+            context.directory.rename(aside)
+        return train(config, context, arm, seed)
+
+    arguments = ("coin", "--steps", "2", "--seeds", "2")
+    monkeypatch.setattr(coin, "train", moving)
+    assert run(*arguments) == 1
+    said = capsys.readouterr().err
+    assert "was moved or removed while its run goes on: put it back, then continue" in said
+    assert directories() == [aside]  # nothing was made in its place
+    monkeypatch.setattr(coin, "train", train)
+    assert run(*arguments) == 0
+    assert run(*arguments) == 0
+    assert (aside / "metrics.jsonl").read_bytes() == (directories()[0] / "metrics.jsonl").read_bytes()
 
 
 def test_a_page_that_cannot_be_written_does_not_hide_what_ended_the_run(monkeypatch):

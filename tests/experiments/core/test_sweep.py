@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from experiments.core import runs
 from experiments.core.artifacts import read_json
 from experiments.core.runner import main
 from experiments.core.runs import locate, locked
@@ -39,8 +40,11 @@ def test_a_stopped_sweep_goes_on_and_runs_nothing_twice(workplace, monkeypatch, 
     (folder,) = Path("runs/sweeps").iterdir()
     made = directories(folder)
     assert len(made) == 4
-    assert sweep(arguments, package=FAKES) == 0
-    assert capsys.readouterr().out.count("finished before") == 4
+    with monkeypatch.context() as changed:
+        changed.setattr(runs, "code_digest", lambda: "of other files")
+        assert sweep(arguments, package=FAKES) == 0
+    out = capsys.readouterr().out
+    assert out.count("finished before") == out.count("other source files made it (code ") == 4
     assert directories(folder) == made
     assert not Path("runs/coin").exists()
     units = read_json(folder / "sweep.json")["units"]

@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from experiments.paper.conflict import contrast, deceptive, picture_prior, revision_share
+from experiments.core.errors import ConfigurationError
+from experiments.paper.conflict import EXPERIMENT, contrast, deceptive, picture_prior, revision_share, run
 from experiments.paper.touch_gain import TouchQuestions, concluded, swap_objects, touch_gain
 from sensors_io.schema import ATTRIBUTES
 from tests.experiments import tiny
@@ -30,6 +31,8 @@ def test_the_prior_from_pictures_is_the_vote_of_the_other_seeds():
     assert [s.tolist() for s in picture_prior(blind)] == [[1, 0, -1], [0, 0, -1], [0, 2, -1]]
     with pytest.raises(ValueError, match="holds 1 seeds"):
         picture_prior(blind[:1])
+    with pytest.raises(ConfigurationError, match="seeds is 1: must be at least 2"):  # before anything is trained
+        run(dataclasses.replace(EXPERIMENT.config, seeds=1), None)
 
 
 def test_a_contrast_counts_each_seeds_own_questions():

@@ -26,6 +26,7 @@ from touchr1_jax.training.feeds import (
 )
 from touchr1_jax.training.packing import Packing
 from touchr1_jax.training.questions import QuestionFeed, equal_blocks, question_batch
+from touchr1_jax.training.train_encoder import touch_rows
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +79,16 @@ def features(data):
 def questions(policy, data, features):
     label = data.label[data.parts["grpo"]]
     return lambda **changes: QuestionFeed(policy, features, label, **{"batch_size": 4, "seed": 1, **changes})
+
+
+def test_batches_of_one_have_the_order_of_larger_ones(encoded, questions):
+    rows = lambda size: np.concatenate(
+        list(itertools.islice(touch_rows(np.arange(5), np.arange(5), batch_size=size, seed=1), 12 // size))
+    )
+    assert rows(1).tolist() == rows(4).tolist()
+    ids = lambda size: np.concatenate([b.ids for b in itertools.islice(questions(batch_size=size), 12 // size)])
+    np.testing.assert_array_equal(ids(1), ids(4))
+    assert next(encoded(batch_size=1)).ids.shape[:2] == (1, 3)
 
 
 @pytest.fixture

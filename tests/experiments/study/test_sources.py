@@ -1,24 +1,29 @@
 """Where data comes from: refused combinations, caches named after what made them."""
 
 import dataclasses
+import shutil
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
 
 from experiments.core.context import Context
-from experiments.core.errors import DataError
+from experiments.core.errors import ConfigurationError, DataError
 from experiments.study import sources
 from experiments.study.dataset import split_parts
 from experiments.study.sources import SourceConfig, odd_contacts, prepare_records
-from experiments.study.training import open_data
+from experiments.study.training import open_data, require_encoder
+from sensors_io.commands.label import Label
 from sensors_io.importers.physiclear import PhysiclearConfig
 from sensors_io.locks import RecordsBusyError
 from sensors_io.records import RecordWriter
 from sensors_io.scenes.config import SceneConfig, config_hash
 from tests.experiments import tiny
 from tests.sensors_io import fakes
+from touchr1_jax.models.pretrained import PretrainedEncoder
 
 GENERATED = SourceConfig(scenes=tiny.SCENES)
 
@@ -27,6 +32,27 @@ def test_records_are_taken_as_they_are(records, context):
     config = dataclasses.replace(GENERATED, data="records", data_dir=records)
     assert prepare_records(config, context) == records
     assert context.timing() == {}
+
+
+def test_records_and_encoders_that_changed_end_a_continued_run(tmp_path, records, policy, params, context):
+    copy, file = tmp_path / "copy", tmp_path / "encoder.npz"
+    shutil.copytree(records, copy)
+    encoder = PretrainedEncoder(
+        config=policy.model.tactile, sensors=tuple(s.name for s in policy.language.sensors), params=params["tactile"]
+    )
+    for _ in range(2):
+        file.write_bytes(encoder.to_bytes())
+        prepare_records(dataclasses.replace(GENERATED, data="records", data_dir=copy), context)
+        require_encoder(file, context)
+    table = tmp_path / "labels.csv"
+    table.write_text("object_id,hardness\ng000000,1\n")
+    assert Label(records=copy, labels=table, annotator="ada").run() == 0
+    with pytest.raises(ConfigurationError, match=r"copy, the records, changed since this run began: .* --fresh"):
+        prepare_records(dataclasses.replace(GENERATED, data="records", data_dir=copy), context)
+    changed = dataclasses.replace(encoder, params=jax.tree.map(jnp.negative, encoder.params))
+    file.write_bytes(changed.to_bytes())
+    with pytest.raises(ConfigurationError, match=r"encoder\.npz, the encoder, changed since this run began"):
+        require_encoder(file, context)
 
 
 def test_generated_scenes_are_named_by_their_hash_and_made_once(tmp_path, cache_dir, records):
