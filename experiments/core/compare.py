@@ -42,7 +42,7 @@ class ComparedFigure(NamedTuple):
 
 
 def compare_runs(runs: Sequence[PastRun], most: int) -> str:
-    """Compare runs as text: runs, differing settings, at most `most` figures that differ, shared ones first, cost.
+    """Compare runs as text: runs, other settings and data, at most `most` differing figures, shared ones first, cost.
 
     `ComparisonError` for fewer than two runs, one named twice, an unfinished one, or runs without a common figure.
     """
@@ -73,9 +73,12 @@ def compare_runs(runs: Sequence[PastRun], most: int) -> str:
         f"{name} {ABSENT if run.seconds is None else duration(run.seconds)}"
         for name, run in zip(names, runs, strict=True)
     )
+    with fitting("results.json"):
+        data = _differences("Different data", names, [(run.results or {}).get("data", {}) for run in runs])
     parts = [
         aligned([(name, run.name, run.summary) for name, run in zip(names, runs, strict=True)]),
         _differences("Different settings", names, settings),
+        data,
         _differences("Different code or machine", names, code),
         _figures_block(found, names, most),
         f"Cost: {', '.join(cost)}",

@@ -75,6 +75,7 @@ class Dataset:
         test = self.parts["test"]
         return counts | {
             "source": self.store.meta.source,
+            "records": self.store.digest,
             "sensors": list(self.clip.sensors),
             "frames_per_clip": self.clip.frames,
             "image_px": self.clip.image_px,

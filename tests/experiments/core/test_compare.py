@@ -103,6 +103,15 @@ def test_two_runs_of_one_experiment(home, capsys):
     assert main(arguments, package=FAKES) == 0
     path.write_text(whole)
     assert "of uncommitted changes" in capsys.readouterr().out
+    path = home / "coin" / second / "results.json"
+    whole = path.read_text()
+    for data, exit_code in (({"records": "labelled anew"}, 0), (["no", "object"], 1)):
+        write_sealed(path, read_json(path) | {"data": data})
+        assert main(arguments, package=FAKES) == exit_code
+    path.write_text(whole)
+    of_data = capsys.readouterr()
+    assert "labelled anew" in of_data.out
+    assert "results.json is not that of a run" in of_data.err
     assert f"A  coin  {first}  smoke" in out
     assert "toss.bias  0.5  0.25" in out
     assert "Different code or machine: nothing" in out
