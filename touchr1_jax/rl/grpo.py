@@ -62,6 +62,7 @@ from touchr1_jax.rl.update import update_policy
 from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.text.template import LevelTokens
 from touchr1_jax.types import SAMPLE, Params, Parsed, Rollout, StepSample
+from touchr1_jax.validation import require_wide
 
 LEAN = {"xla_cpu_use_fusion_emitters": False}
 """The newer generator holds all kernels in MLIR until the last is compiled, .5 GB even for a tiny step."""
@@ -115,7 +116,12 @@ class Group(NamedTuple):
 
 
 def start_state(params: Params, optimizer: optax.GradientTransformation, key: Array, config: GRPOConfig) -> GRPOState:
-    """State before the first step, in new buffers, because steps donate their state."""
+    """State before the first step, in new buffers, because steps donate their state.
+
+    Raises:
+      ValueError: as `require_wide`.
+    """
+    require_wide(params)
     copy = lambda: jax.tree.map(jnp.copy, params)
     own = copy()
     return GRPOState(
@@ -215,7 +221,8 @@ class GRPOEngine:
         sample: dict[str, Any] = {}
         if self.sampled:
             asked, label = group.batch.target.asked[0], group.batch.target.label[0]
-            sample[SAMPLE] = StepSample(asked, label, group.rollout.tokens[0, 0], group.reward[0, 0])
+            earned = jnp.where(group.finite[0], group.reward[0, 0], jnp.nan)  # else it is the mean of other groups
+            sample[SAMPLE] = StepSample(asked, label, group.rollout.tokens[0, 0], earned)
         if self.config.algorithm.candidates > 1:
             drawn = self.group_metrics(group) | self.answered(group)
             metrics |= {f"drawn_{name}": value for name, value in drawn.items()}
