@@ -34,8 +34,8 @@ def encode_contacts(fns: PolicyFns, params: Params, batches: Iterable[TouchBatch
         finite = np.isfinite(getattr(every, name).astype(np.float32)).reshape(len(every.stream_mask), -1).all(-1)
         if not finite.all():
             raise ValueError(
-                f"{name} of contact {np.argmin(finite)} is encoded as numbers that are not finite, in {(~finite).sum()} "
-                f"of {len(finite)}: must be finite; correct its frames and force, or train the encoder again"
+                f"{name} of contact {np.argmin(finite)} is encoded as numbers that are not finite, in "
+                f"{(~finite).sum()} of {len(finite)}: must be finite; correct its frames and force, or train the encoder again"
             )
     return every
 
