@@ -35,7 +35,8 @@ def encode_contacts(fns: PolicyFns, params: Params, batches: Iterable[TouchBatch
         if not finite.all():
             raise ValueError(
                 f"{name} of contact {np.argmin(finite)} is encoded as numbers that are not finite, in "
-                f"{(~finite).sum()} of {len(finite)}: must be finite; correct its frames and force, or train the encoder again"
+                f"{(~finite).sum()} of {len(finite)}: must be finite; correct its frames and force, or train the "
+                "encoder again"
             )
     return every
 
