@@ -3,6 +3,9 @@
 import math
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+
 
 def at_least(config: Any, bound: float, *fields: str) -> None:
     """Check that fields are ≥ a bound, and finite.
@@ -57,4 +60,21 @@ def unused(config: Any, where: str, **values: Any) -> None:
         if (given := getattr(config, field)) != value:
             raise ValueError(
                 f"{where}.{field} is {given}: must be {value}, for this stage does not read it; leave it out"
+            )
+
+
+def require_wide(params: Any) -> None:
+    """Check that no trained parameter is rounded to fewer than 32 bits, which would swallow small updates.
+
+    Args:
+      params: arrays, or their shapes.
+
+    Raises:
+      ValueError: naming a parameter and its type.
+    """
+    for path, x in jax.tree_util.tree_leaves_with_path(params):
+        if jnp.issubdtype(x.dtype, jnp.floating) and x.dtype.itemsize < 4:
+            raise ValueError(
+                f"params{jax.tree_util.keystr(path)} is {x.dtype}: must be float32 where it is trained, for its "
+                "rounding swallows small updates; cast it, and set bfloat16 to compute in bfloat16, or train adapters"
             )

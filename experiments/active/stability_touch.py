@@ -29,10 +29,10 @@ from experiments.active.world import TouchWorld, WorldConfig, make_world
 from experiments.core.concurrency import concurrently
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
+from experiments.core.loops import ALARM
 from experiments.core.metric_log import read_metrics
 from experiments.core.results import Requirement, Results, Table, at_least, named_table
 from experiments.core.runner import Experiment
-from experiments.study.alarm_log import ALARM
 from experiments.study.training import preset_name
 from touchr1_jax.models.active_policy import ActivePolicy
 from touchr1_jax.training.exploration import NO_CHOICE

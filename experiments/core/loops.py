@@ -14,6 +14,8 @@ from touchr1_jax.training.loop import SKIPPED, Batches, Hooks, Log, LoopConfig, 
 STEPPING, WAITING = "in steps", "waiting for data"
 """Names in `timing` of the steps after the first and of their waiting for a batch, each followed by `/STAGE`."""
 
+ALARM = "alarm_"  # prefix of the logged metrics that hold alarms, followed by their code
+
 COMPILING = "compiling the first step"  # note beside the bar of a stage until its first step is done
 
 MakeLog = Callable[[Context, str, int], Log]
@@ -110,6 +112,20 @@ def left_out_tables(lines: Iterable[Mapping[str, Any]]) -> tuple[Table, ...]:
             rows.append({"stage": stage, "steps": len(of_stage), "updates left out": updates, "groups left out": named})
     note = "A gradient, or a reward in the named share of the groups, was NaN or infinite."
     return (named_table("Left out of training", rows, note=note),) if rows else ()
+
+
+def alarm_tables(lines: Iterable[Mapping[str, Any]]) -> tuple[Table, ...]:
+    """A table of the alarms of training, if any fired."""
+    steps: dict[tuple[str, str], list[int]] = {}
+    for line in lines:
+        for name in (name for name in line if name.startswith(ALARM)):
+            steps.setdefault((line["stage"], name.removeprefix(ALARM)), []).append(line["step"])
+    rows = [
+        {"stage": stage, "alarm": code, "first at step": min(at), "steps": len(at)}
+        for (stage, code), at in sorted(steps.items())
+    ]
+    note = "docs/GLOSSARY.md says what a code means; the console named the number and its bound."
+    return (named_table("Alarms of training", rows, note=note),) if rows else ()
 
 
 def run_loop(

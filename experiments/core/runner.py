@@ -28,7 +28,7 @@ from experiments.core import numerics, runs, watchers
 from experiments.core.artifacts import DamagedFileError, jsonable, write_sealed
 from experiments.core.commands import PROG, find, print_error, print_lines, run_command
 from experiments.core.context import Context
-from experiments.core.loops import left_out_tables
+from experiments.core.loops import alarm_tables, left_out_tables
 from experiments.core.memory import require_memory
 from experiments.core.metric_log import read_metrics
 from experiments.core.remote_runs import run_at
@@ -376,7 +376,8 @@ def _compute(
             context.require_log()
             results = experiment.run(command.config, context)
             context.require_in_place()
-        tables = (*results.tables, *left_out_tables(read_metrics(directory)))
+        logged = [*read_metrics(directory)]
+        tables = (*results.tables, *left_out_tables(logged), *alarm_tables(logged))
         timing, drawn = {**context.timing(), **results.timing}, {**experiment.curves, **results.curves}
         results = dataclasses.replace(results, timing=timing, tables=tables, curves=drawn)
         report = write_report(directory, results, about=about, description=description)

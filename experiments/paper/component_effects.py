@@ -9,11 +9,11 @@ import numpy as np
 from experiments.core.charts import Panel, Rule, Series, draw, estimates
 from experiments.core.context import Context
 from experiments.core.look import PALETTE, SHARED
+from experiments.core.loops import ALARM
 from experiments.core.metric_log import read_metrics
 from experiments.core.results import Estimate, Picture, Results, Table, named_table
 from experiments.core.text import bounds, interval, number
 from experiments.study.ablation import Ablation, run_ablation
-from experiments.study.alarm_log import ALARM
 from experiments.study.estimates import RESAMPLES, SeedScores, estimate
 from experiments.study.scores import Scored, baselines, score
 from experiments.study.study import Study, StudyConfig

@@ -3,12 +3,11 @@
 from collections.abc import Callable
 
 from experiments.core.context import Context
+from experiments.core.loops import ALARM
 from experiments.core.metric_log import read_metrics
 from touchr1_jax.rl.alarms import RULES, AlarmMonitor, AlarmRule
 from touchr1_jax.rl.scoring import NONFINITE_IN
 from touchr1_jax.training.loop import SKIPPED
-
-ALARM = "alarm_"  # prefix of the logged metrics that hold alarms, followed by their code
 
 
 def alarm_log(

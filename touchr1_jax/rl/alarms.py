@@ -187,6 +187,12 @@ def left_out_updates(now: Metrics, start: Metrics) -> float | None:
     return now[LEFT_OUT]
 
 
+def learned_prompts(now: Metrics, start: Metrics) -> float | None:
+    """F15: prompts of which a rollout is learned from, neither masked as cut off nor dropped by `mismatch_limit`."""
+    del start
+    return now.get("kept_prompts")
+
+
 def frozen_time(now: Metrics, start: Metrics) -> float | None:
     """F12: share of streams whose steps all have one time id."""
     del start
@@ -321,6 +327,15 @@ RULES: tuple[AlarmRule, ...] = (
         bound=0.1,
         reason="one update in ten is lost; a single one may be a rare overflow",
         check=left_out_updates,
+        at_once=True,
+    ),
+    AlarmRule(
+        code="F15",
+        meaning="no rollout is learned from: all are cut off, or too far from the sampler",
+        bound=0.5,
+        reason="the policy gradient is then 0, whatever the rewards are",
+        check=learned_prompts,
+        below=True,
         at_once=True,
     ),
     AlarmRule(

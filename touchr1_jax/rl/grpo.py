@@ -50,6 +50,7 @@ from touchr1_jax.rl.metrics import (
 )
 from touchr1_jax.rl.rollout import GRPOBatch, SampleConfig, encode_prompts, sample_prompts
 from touchr1_jax.rl.scoring import (
+    NONFINITE_IN,
     ScoreFn,
     WeightedScore,
     left_out_groups,
@@ -61,6 +62,7 @@ from touchr1_jax.rl.update import update_policy
 from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.text.template import LevelTokens
 from touchr1_jax.types import SAMPLE, Params, Parsed, Rollout, StepSample
+from touchr1_jax.validation import require_wide
 
 LEAN = {"xla_cpu_use_fusion_emitters": False}
 """The newer generator holds all kernels in MLIR until the last is compiled, .5 GB even for a tiny step."""
@@ -114,7 +116,12 @@ class Group(NamedTuple):
 
 
 def start_state(params: Params, optimizer: optax.GradientTransformation, key: Array, config: GRPOConfig) -> GRPOState:
-    """State before the first step, in new buffers, because steps donate their state."""
+    """State before the first step, in new buffers, because steps donate their state.
+
+    Raises:
+      ValueError: as `require_wide`.
+    """
+    require_wide(params)
     copy = lambda: jax.tree.map(jnp.copy, params)
     own = copy()
     return GRPOState(
@@ -214,7 +221,8 @@ class GRPOEngine:
         sample: dict[str, Any] = {}
         if self.sampled:
             asked, label = group.batch.target.asked[0], group.batch.target.label[0]
-            sample[SAMPLE] = StepSample(asked, label, group.rollout.tokens[0, 0], group.reward[0, 0])
+            earned = jnp.where(group.finite[0], group.reward[0, 0], jnp.nan)  # else it is the mean of other groups
+            sample[SAMPLE] = StepSample(asked, label, group.rollout.tokens[0, 0], earned)
         if self.config.algorithm.candidates > 1:
             drawn = self.group_metrics(group) | self.answered(group)
             metrics |= {f"drawn_{name}": value for name, value in drawn.items()}
@@ -225,7 +233,9 @@ class GRPOEngine:
         lagged, in_reward = not ratio_to_learner(self.config.algorithm), self.config.algorithm.kl_in_reward
         rounds_otherwise = self.config.bfloat16 or group.batch.rollout is not None
         own = passed(sampler) if lagged or (in_reward and rounds_otherwise) else group.rollout.log_prob
-        group = self.penalised(group, own - passed(reference)) if in_reward else group
+        if in_reward:
+            group, left_out = self.penalised(group, own - passed(reference))
+            metrics |= left_out
         learn = self.experience(group, self.perturbed(group.batch, frozen, mask_key))
         learn = learn._replace(old=own) if lagged else learn
         params, opt_state, parts = update_policy(
@@ -292,17 +302,19 @@ class GRPOEngine:
             equal &= zero_variance(group.bonus)
         return equal | ~group.finite
 
-    def penalised(self, group: Group, log_ratio: Float[Array, "P G T"]) -> Group:
+    def penalised(self, group: Group, log_ratio: Float[Array, "P G T"]) -> tuple[Group, dict[str, Array]]:
         """The group with −β Σ_t log(π/π_ref) as a further term of its reward: the unbiased estimate k1 of the KL.
 
         `log_ratio` is of one pass where the sampler rounds otherwise: σ would make an advantage of the difference among
-        equal answers.  Groups that are left out, also for this term, again have the mean of all others.
+        equal answers.  Groups that are left out, also for this term, again have the mean of all others; the share of
+        those that only this term leaves out is `nonfinite_in_kl`.
         """
         term = -self.config.algorithm.beta * masked.total(log_ratio, group.rollout.mask, -1)
         finite = group.finite & squares_fit(term) & squares_fit(group.reward + term)
         neutral = functools.partial(neutralised, finite=finite)
         reward, terms = jax.tree.map(neutral, (group.reward + term, {**group.terms, "kl": term}))
-        return group._replace(reward=reward, terms=terms, finite=finite)
+        left_out = {f"{NONFINITE_IN}kl": jnp.mean(group.finite & ~finite)}
+        return group._replace(reward=reward, terms=terms, finite=finite), left_out
 
     def perturbed(self, batch: Any, frozen: Any, key: Array) -> tuple[Array, Int[Array, "P"]]:
         """Touch with one stream of each prompt replaced by noise, for the grounding term, and which stream."""

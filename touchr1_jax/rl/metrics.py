@@ -110,7 +110,7 @@ def advantage_metrics(reward: Float[Array, "P G"], advantage: Float[Array, "P G"
 
 def touch_metrics(features: Features, step_tokens: int) -> dict[str, Array]:
     """`static_time_share`: share of streams with several steps, of `step_tokens` each, whose time ids are all equal;
-    `touch_share`: share of prompts with any touch.
+    `touch_share`: share of prompts with any token of touch.
     """
     time, there = features.touch_time, features.touch_time >= 0
     several = features.stream_mask & (jnp.sum(there, -1) > step_tokens)
@@ -118,5 +118,5 @@ def touch_metrics(features: Features, step_tokens: int) -> dict[str, Array]:
     high = masked.maximum(time, there, -1, empty=0.0)
     return {
         "static_time_share": masked.mean(low == high, several),
-        "touch_share": jnp.mean(jnp.any(features.stream_mask, -1)),
+        "touch_share": jnp.mean(jnp.any(features.stream_mask & jnp.any(there, -1), -1)),
     }

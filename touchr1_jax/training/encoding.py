@@ -22,10 +22,23 @@ BATCH = 8
 
 
 def encode_contacts(fns: PolicyFns, params: Params, batches: Iterable[TouchBatch], *, blind: bool = False) -> Features:
-    """Features of all contacts of some batches, in their order, on the host; a blind policy has no streams."""
+    """Features of all contacts of some batches, in their order, on the host; a blind policy has no streams.
+
+    Raises:
+      ValueError: features that are not finite, from which a policy would give the same answer to every question.
+    """
     encode, params = encode_program(fns, blind), committed(params)
     found = [jax.device_get(encode(params, batch)) for batch in batches]
-    return jax.tree.map(lambda *x: np.concatenate(x), *found)
+    every: Features = jax.tree.map(lambda *x: np.concatenate(x), *found)
+    for name in ("touch", "view"):
+        finite = np.isfinite(getattr(every, name).astype(np.float32)).reshape(len(every.stream_mask), -1).all(-1)
+        if not finite.all():
+            raise ValueError(
+                f"{name} of contact {np.argmin(finite)} is encoded as numbers that are not finite, in "
+                f"{(~finite).sum()} of {len(finite)}: must be finite; correct its frames and force, or train the "
+                "encoder again"
+            )
+    return every
 
 
 def touch_statistics(config: TactileViTConfig, batches: Iterable[TouchBatch]) -> TouchBatch:

@@ -91,8 +91,12 @@ def cross_fit(
       config: folds and fit.
 
     Raises:
-      ValueError: fewer groups than folds.
+      ValueError: fewer groups than folds, or a feature that is not finite, which would erase it in all rows.
     """
+    odd = np.argwhere(~np.isfinite(features))
+    if odd.size:
+        (row, column), value = odd[0], features[tuple(odd[0])]
+        raise ValueError(f"features[{row}, {column}] is {value}: must be finite; correct the contact or leave it out")
     fold = group_folds(groups, config)
     weights = np.stack([(fold != k) & (labels >= 0) for k in range(config.folds)])
     return probe_log_probs(features, labels, weights, levels, config)[fold, np.arange(len(fold))]

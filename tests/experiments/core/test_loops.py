@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import pytest
 
 from experiments.core.artifacts import read_json
-from experiments.core.loops import left_out_tables, run_loop
+from experiments.core.loops import ALARM, alarm_tables, left_out_tables, run_loop
 from experiments.faults.digests import differences, digests
 from experiments.faults.fixtures import run_counting, run_directory
 from experiments.faults.trainings import counting
@@ -81,6 +81,14 @@ def test_groups_that_a_reward_left_out_are_counted_for_each_stage():
     (table,) = left_out_tables(lines)
     assert table.rows == (("grpo/a/0", 2, 0.0, "spread 25.0%"),)
     assert left_out_tables(lines[1:]) == ()
+
+
+def test_the_report_has_the_alarms_of_each_stage():
+    steps = [("grpo/a/0", 0, {}), ("grpo/a/0", 1, {"F10": 0.0}), ("grpo/a/0", 2, {"F10": 0.0}), ("sft/0", 0, {})]
+    lines = [{"stage": s, "step": t, **{f"{ALARM}{code}": x for code, x in found.items()}} for s, t, found in steps]
+    (table,) = alarm_tables(lines)
+    assert table.rows == (("grpo/a/0", "F10", 1, 2),)
+    assert alarm_tables(lines[:1]) == ()
 
 
 # Orbax gives up at the first array that it cannot read; what the others call back then finds its loop closed

@@ -17,7 +17,7 @@ from touchr1_jax.rl.grpo import GRPOEngine, make_grpo_step, start_state
 from touchr1_jax.rl.scoring import left_out_groups
 from touchr1_jax.rl.update import finite_update
 from touchr1_jax.skipping import count_skipped, skip_nonfinite
-from touchr1_jax.types import Rollout
+from touchr1_jax.types import SAMPLE, Rollout
 
 CONFIG = GRPOConfig(prompts=P, group=3, length=4, micro_prompts=2, algorithm=Paper(gamma=0.0))
 OPTIMIZER = optax.adam(0.05)
@@ -38,14 +38,16 @@ def worth(tokens, target):
 @pytest.mark.long
 def test_a_reward_that_is_nan_costs_its_group_and_nothing_else():
     """The step is that of a group whose rewards are all equal, which teaches nothing either."""
-    step, batch = make_grpo_step(FNS, worth, OPTIMIZER, CONFIG), tiny.question_batch(1, P)
+    step, batch = make_grpo_step(FNS, worth, OPTIMIZER, CONFIG, sampled=True), tiny.question_batch(1, P)
 
     def learn(label):
         state = start_state(tiny.shallow_params(0), OPTIMIZER, jax.random.key(1), CONFIG)
         target = batch.target.replace(label=jnp.where(batch.target.asked[:, :1], label, batch.target.label))
         return jax.device_get(step(state, batch.replace(target=target), FROZEN))
 
-    (broken, metrics), (equal, _) = learn(BROKEN), learn(EQUAL)
+    (broken, metrics), (equal, others) = learn(BROKEN), learn(EQUAL)
+    assert np.isnan(metrics.pop(SAMPLE).reward)
+    assert others[SAMPLE].reward == np.float32(0.4)
     jax.tree.map(np.testing.assert_array_equal, broken.params, equal.params)
     assert all(np.isfinite(value) for value in metrics.values())
     assert metrics["nonfinite_share"] == metrics["nonfinite_in_spread"] == 1 / P
@@ -156,3 +158,10 @@ def test_dynamic_sampling_logs_what_it_passed_over():
         np.testing.assert_allclose(chosen[f"drawn_{name}"], whole[name], rtol=1e-6)
     assert chosen["degenerate_share"] < chosen["drawn_degenerate_share"]
     assert chosen["reward"] != chosen["drawn_reward"]
+
+
+def test_trained_parameters_have_32_bits():
+    """An update of 1e-6 is less than bfloat16 rounds a weight of .02."""
+    narrow = {"decoder": {"kernel": jnp.full(3, 0.02, jnp.bfloat16)}}
+    with pytest.raises(ValueError, match=r"decoder.*kernel.* is bfloat16: must be float32 where it is trained"):
+        start_state(narrow, OPTIMIZER, jax.random.key(0), CONFIG)

@@ -111,3 +111,5 @@ def test_touch_metrics_by_hand():
     features = tiny.features(0, 3).replace(touch_time=time, stream_mask=present)
     assert_metrics(touch_metrics(features, 1), {"static_time_share": 0.5, "touch_share": 2 / 3})
     assert_metrics(touch_metrics(features, 2), {"static_time_share": 0.0, "touch_share": 2 / 3})
+    empty = features.replace(touch_time=jnp.full_like(time, -1))
+    assert touch_metrics(empty, 1)["touch_share"] == 0

@@ -175,6 +175,10 @@ def test_a_group_that_is_left_out_has_the_mean_kl_of_the_others():
     _, metrics = step(state, BATCH, FROZEN)
     np.testing.assert_allclose(metrics["reward_kl"], -0.1 * kl[~left_out].mean(), rtol=1e-4)
     assert abs(kl.mean() - kl[~left_out].mean()) > 1e-3
+    assert metrics["nonfinite_in_kl"] == 0
+    broken_reference = jax.tree.map(lambda x: jnp.nan * x, FROZEN.reference)
+    _, metrics = step(of()[1], BATCH, FROZEN._replace(reference=broken_reference))
+    assert (metrics["nonfinite_in_kl"], metrics["nonfinite_share"]) == (np.mean(~left_out), 1)
 
 
 CUT_OFF, EQUAL = 3, 6

@@ -2,11 +2,13 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from sensors_io.schema import CLIP_ARRAYS
+from tests.touchr1_jax import tiny
 from tests.touchr1_jax.tiny import FNS
 from touchr1_jax.models.policy_fns import PolicyFns
-from touchr1_jax.training.encoding import noise_bank
+from touchr1_jax.training.encoding import encode_contacts, noise_bank
 from touchr1_jax.types import TouchBatch
 
 
@@ -74,3 +76,21 @@ def test_no_draw_has_the_frames_of_a_sensor_that_recorded_none():
     """The encoder reads masked frames as nothing: such a draw would be no noise, but a blank."""
     mask = bank(touched(np.full(8, 100)[:, None], np.zeros(3)), 8)[-1]
     assert mask.any(-1).all()
+
+
+class Pushed(PolicyFns):
+    """In the place of the policy: touch that is as strong as the force."""
+
+    def encode(self, params, batch, *, blind):
+        del params, blind
+        features = tiny.features(0, len(batch.label))
+        return features.replace(touch=features.touch + batch.force_n[:, :, :1, :1])
+
+
+def test_a_contact_whose_features_are_not_finite_is_named():
+    """A policy would answer the first word of its vocabulary, in validation and tests without a word."""
+    batches = [tiny.touch_batch(seed, 2) for seed in range(2)]
+    assert len(encode_contacts(Pushed(**vars(FNS)), {}, batches).touch) == 4
+    batches[1].force_n[0, 1, 0] = np.nan
+    with pytest.raises(ValueError, match="touch of contact 2 is encoded as numbers that are not finite, in 1 of 4"):
+        encode_contacts(Pushed(**vars(FNS)), {}, batches)
