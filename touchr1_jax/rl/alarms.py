@@ -187,10 +187,10 @@ def left_out_updates(now: Metrics, start: Metrics) -> float | None:
     return now[LEFT_OUT]
 
 
-def learned_prompts(now: Metrics, start: Metrics) -> float | None:
-    """F15: prompts of which a rollout is learned from, neither masked as cut off nor dropped by `mismatch_limit`."""
+def learned_rollouts(now: Metrics, start: Metrics) -> float | None:
+    """F15: share of the rollouts that are learned from, neither masked as cut off nor dropped by `mismatch_limit`."""
     del start
-    return now.get("kept_prompts")
+    return now.get("learned_share")
 
 
 def frozen_time(now: Metrics, start: Metrics) -> float | None:
@@ -331,10 +331,10 @@ RULES: tuple[AlarmRule, ...] = (
     ),
     AlarmRule(
         code="F15",
-        meaning="no rollout is learned from: all are cut off, or too far from the sampler",
+        meaning="fewer than half of the rollouts are learned from: the others are cut off, or too far from the sampler",
         bound=0.5,
-        reason="the policy gradient is then 0, whatever the rewards are",
-        check=learned_prompts,
+        reason="the policy gradient then shows a minority of the rollouts that the rewards compare",
+        check=learned_rollouts,
         below=True,
         at_once=True,
     ),

@@ -190,11 +190,12 @@ def too_far(algorithm: Algorithm, log_ratio: Float[Array, "*n T"], mask: Bool[Ar
 def mismatch_parts(
     gap: Float[Array, "P G T"], mask: Bool[Array, "P G T"], dropped: Bool[Array, "P G"]
 ) -> dict[str, Float[Array, "P"]]:
-    """Of each prompt: mean and largest |gap| of its tokens, share of dropped rollouts, whether tokens stay or exist."""
+    """Of each prompt: mean and largest |gap|, shares of rollouts dropped and learned from, whether tokens stay, exist."""
     return {
         "sampler_gap": masked.mean_of_means(jnp.abs(gap), mask),
         "sampler_gap_peak": jnp.max(jnp.where(mask, jnp.abs(gap), 0.0), (-2, -1)),
         "dropped_share": jnp.mean(dropped, -1),
+        "learned_share": jnp.mean(jnp.any(mask, -1) & ~dropped, -1),
         "kept_prompts": jnp.any(mask & ~dropped[..., None], (-2, -1)).astype(jnp.float32),
         "drawn_prompts": jnp.any(mask, (-2, -1)).astype(jnp.float32),
     }
@@ -282,10 +283,7 @@ def surrogate(
 
 
 def divisor(config: GRPOConfig, mask: Bool[Array, "P G T"]) -> int | Float[Array, ""]:
-    """N of `group_mean`: the mean length of the rollouts if tokens are averaged over the batch, otherwise T.
-
-    1 for a batch without a token, whose means are 0.
-    """
+    """N of `group_mean`: the rollouts' mean length (1 without tokens) if tokens are averaged over the batch, else T."""
     if config.algorithm.average is not Average.BATCH:
         return config.length
     return jnp.where(jnp.any(mask), jnp.mean(jnp.sum(mask, -1)), 1.0)

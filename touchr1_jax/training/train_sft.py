@@ -26,7 +26,7 @@ from touchr1_jax.training.optimizer import OptimizerConfig, make_optimizer
 from touchr1_jax.training.packing import Packing
 from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
 from touchr1_jax.types import Params
-from touchr1_jax.validation import at_least, within
+from touchr1_jax.validation import at_least, require_wide, within
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -107,7 +107,7 @@ def train_sft(
 
     Raises:
       SizeError: a policy with frozen towers, and no adapters.
-      ValueError: `held_out` without checkpoints.
+      ValueError: `held_out` without checkpoints, or as `require_wide`.
     """
     lora = policy.fns.lora
     if policy.frozen and not lora.rank:
@@ -118,6 +118,7 @@ def train_sft(
     frozen = {name: tree for name, tree in part.items() if name in stand_still}
     optimizer, step = sft_program(policy.fns, config, blind)
     trained = {name: tree for name, tree in part.items() if name not in frozen}
+    require_wide(trained)
     trained = jax.tree.map(jnp.copy, trained)  # a step takes over the buffers of its state
     state = SFTState(params=trained, opt_state=optimizer.init(trained), step=jnp.zeros((), jnp.int32))
     loop = LoopConfig(steps=config.steps, save_every=config.save_every)
