@@ -107,25 +107,25 @@ class VideoFile:
         capture = self._open()
         try:
             count = time_ns = 0
-            last_ms = first_ms = 0.0
+            first_ms = last = 0.0
             stated = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
             while capture.grab():
                 ok, image = capture.retrieve()
                 if not ok:
                     break
-                last_ms = capture.get(cv2.CAP_PROP_POS_MSEC)
+                stamp_ms, last = capture.get(cv2.CAP_PROP_POS_MSEC), capture.get(cv2.CAP_PROP_PTS)
                 if count == 0:
-                    first_ms = last_ms
+                    first_ms = stamp_ms
                 else:
-                    own_ns = round((last_ms - first_ms) * 1e6)
+                    own_ns = round((stamp_ms - first_ms) * 1e6)
                     time_ns = own_ns if own_ns > time_ns else round(time_ns + NS_PER_S / self._rate_hz)
                 yield Recorded(time_ns=time_ns, index=count, frame=cv2.cvtColor(image, cv2.COLOR_BGR2RGB), arrays={})
                 count += 1
         finally:
             capture.release()
-        if is_cut_off(self.path, stated, count, self._rate_hz, last_ms):
+        if is_cut_off(self.path, stated, count, self._rate_hz, last):
             raise StreamEndedError(
-                f"{self.path} is cut off: {count} of {stated} frames could be decoded and were replayed; put a whole "
+                f"{self.path} is cut off: {count} of {max(stated, count + 1)} frames could be decoded and were replayed; put a whole "
                 "copy back"
             )
 
