@@ -172,6 +172,10 @@ class Sequence:
         check_arrays(FRAME_ARRAYS, {name: getattr(self, name) for name in FRAME_ARRAYS}, where=f"{self.name}")
         seen = self.frames is not None or self.deformation_mm is not None or self.depth_mm is not None
         _require(seen, "frames", None, "a sequence needs camera frames or fields", "store at least one of them")
+        told = self.camera.get("recording", {}) if isinstance(self.camera, Mapping) else None
+        ok = isinstance(told, Mapping) and isinstance(told.get("background"), str | None)
+        ok = ok and isinstance(told.get("left_out", 0), int)
+        _require(ok, f"{self.name}: camera", self.camera, "must map names; its `recording` too", "leave `recording` out")
 
     @property
     def name(self) -> str:

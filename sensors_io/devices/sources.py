@@ -16,6 +16,7 @@ from sensors_io.devices.errors import DeviceNotFoundError, StreamEndedError
 from sensors_io.errors import path_text
 from sensors_io.importers.pictures import PictureError, below, read_picture
 from sensors_io.importers.video import is_cut_off
+from sensors_io.index import looks_like_records
 from sensors_io.records import RecordStore
 from sensors_io.schema import FRAME_ARRAYS, Flag, Sequence
 
@@ -258,7 +259,7 @@ def source_of(
     """
     if not path.exists():
         raise DeviceNotFoundError(f"{path} does not exist; give a recording")
-    if (path / "index.json").is_file():
+    if looks_like_records(path):
         return RecordedContact(path=path, contact=contact, sensor=sensor)
     if path.suffix == ".npz" or (path / "index.npy").is_file():
         return Tac3dRecording(path=path)

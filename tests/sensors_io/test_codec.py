@@ -108,6 +108,8 @@ def test_what_cannot_be_stored_is_refused():
     for gain in (np.float32(1), float("nan"), float("inf")):
         said = "settings cannot be stored as JSON"
         refused(SchemaError, said, codec.encode_sequence, sequence(camera={"gain": gain}))
+    for camera in (None, [], {"recording": None}, {"recording": {"background": 3}}, {"recording": {"left_out": "3"}}):
+        refused(SchemaError, "camera is .* must map names", sequence, camera=camera)
 
 
 @hypothesis.given(st.data())
