@@ -12,7 +12,7 @@ import numpy as np
 from sensors_io.clock import NS_PER_S
 from sensors_io.devices import tac3d_messages
 from sensors_io.devices.base import Identity
-from sensors_io.devices.errors import DeviceNotFoundError, StreamEndedError
+from sensors_io.devices.errors import DeviceDataError, DeviceNotFoundError, StreamEndedError
 from sensors_io.errors import path_text
 from sensors_io.importers.pictures import PictureError, below, read_picture
 from sensors_io.importers.video import is_cut_off
@@ -214,10 +214,23 @@ class Tac3dRecording:
 
     @property
     def identity(self) -> Identity:
+        assert self._recorded is not None  # a reader takes what is raised later for a broken sample
         return Identity(sensor="tac3d", serial=self.path.stem, product="Tac3D recording", where=str(self.path))
 
+    @functools.cached_property
+    def _recorded(self) -> tac3d_messages.Tac3dArrays:
+        try:
+            recorded = tac3d_messages.load_recording(self.path)
+            tac3d_messages.to_schema({name: a[0] for name, a in recorded.matrices.items()})
+        except DeviceDataError as error:
+            raise DeviceNotFoundError(str(error)) from error
+        times = recorded.send_time_s
+        if len(times) > 1 and ((np.diff(times) < 0).any() or times[0] == times[-1]):
+            raise DeviceNotFoundError(f"{self.path}: sendTimestamp: must rise; replay another recording")
+        return recorded
+
     def samples(self) -> Iterator[Recorded]:
-        recorded = tac3d_messages.load_recording(self.path)
+        recorded = self._recorded
         start = recorded.send_time_s[0]
         for i, index in enumerate(recorded.index):
             fields = tac3d_messages.to_schema({name: a[i] for name, a in recorded.matrices.items()})

@@ -264,9 +264,10 @@ class _Session:
         times = np.array([s.host_time_ns for s in samples], np.int64)
         force, moment = _stacked(samples, "force_n"), _stacked(samples, "moment_nmm", lacking=0.0)
         beyond = np.array([bool(s.arrays.get("out_of_range", False)) for s in samples], bool)
-        if self._config.gravity is not None:
-            force, moment = self._config.gravity.contact(force, moment, self._config.down)
-        force, moment = self._config.mount.to_gel(force, moment)
+        with np.errstate(invalid="ignore"):  # of readings that are not finite, which are journaled as they are
+            if self._config.gravity is not None:
+                force, moment = self._config.gravity.contact(force, moment, self._config.down)
+            force, moment = self._config.mount.to_gel(force, moment)
         if samples:
             journal.append("force", {}, time_ns=times, force_n=force, moment_nmm=moment, out_of_range=beyond)
             self._alarm = "the force sensor is out of its range: release" if beyond[-1] else ""
