@@ -180,7 +180,7 @@ class Sequence:
         told = self.camera.get("recording", {}) if isinstance(self.camera, Mapping) else None
         ok = isinstance(told, Mapping) and isinstance(told.get("background"), str | None)
         ok = ok and isinstance(told.get("left_out", 0), int)
-        _require(ok, f"{self.name}: camera", self.camera, "must map names; its `recording` too", "leave `recording` out")
+        _require(ok, f"{self.name}: camera", self.camera, "must map names, its `recording` too", "leave that out")
 
     @property
     def name(self) -> str:

@@ -59,7 +59,9 @@ def _mean_force(device: Device, seconds: float) -> np.ndarray:
         sample = device.read(_TIMEOUT_S)
         if "force_n" not in sample.arrays:
             name = device.identity.sensor
-            raise DeviceDataError(f"{name} sent a sample without force; let its program send it, and take the zero again")
+            raise DeviceDataError(
+                f"{name} sent a sample without force; let its program send it, and take the zero again"
+            )
         forces.append(sample.arrays["force_n"])
     return np.mean(forces, axis=0)
 

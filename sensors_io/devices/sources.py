@@ -126,8 +126,8 @@ class VideoFile:
             capture.release()
         if is_cut_off(self.path, stated, count, self._rate_hz, last):
             raise StreamEndedError(
-                f"{self.path} is cut off: {count} of {max(stated, count + 1)} frames could be decoded and were replayed; put a whole "
-                "copy back"
+                f"{self.path} is cut off: {count} of {max(stated, count + 1)} frames could be decoded and were "
+                "replayed; put a whole copy back"
             )
 
     def _open(self) -> cv2.VideoCapture:

@@ -177,4 +177,4 @@ def test_what_is_no_picture_is_refused(tmp_path: pathlib.Path) -> None:
         (tmp_path / lost / "backgrounds").mkdir(parents=True)
         (tmp_path / lost / lost).mkdir()
         refused(MissingIndexError, "has no index.json", read_pictures, [tmp_path / lost], "x")
-        refused(MissingIndexError, "has no index.json", lambda: source_of(tmp_path / lost).identity)
+        refused(MissingIndexError, "has no index.json", getattr, source_of(tmp_path / lost), "identity")
