@@ -255,6 +255,11 @@ def settled(root: Place, opened: Callable[[dict[str, Any], str], _T]) -> _T:
                 raise
 
 
+def looks_like_records(path: pathlib.Path) -> bool:
+    """True of a folder with an index, or with what stands beside one that is lost: its pictures are no others."""
+    return any((path / name).exists() for name in (INDEX, JOURNALS)) or any(path.glob("*.arrayrecord"))
+
+
 def read_root(root: Place) -> tuple[dict[str, Any], str]:
     """The root of an index, of a version that this code reads, and the first 16 hex digits of its file's SHA-256.
 

@@ -10,6 +10,7 @@ clip, A attributes.
 
 import dataclasses
 import enum
+import numbers
 import re
 from collections.abc import Mapping
 from typing import Any
@@ -172,6 +173,14 @@ class Sequence:
         check_arrays(FRAME_ARRAYS, {name: getattr(self, name) for name in FRAME_ARRAYS}, where=f"{self.name}")
         seen = self.frames is not None or self.deformation_mm is not None or self.depth_mm is not None
         _require(seen, "frames", None, "a sequence needs camera frames or fields", "store at least one of them")
+        empty = [name for name in FRAME_ARRAYS if (a := getattr(self, name)) is not None and 0 in a.shape[1:]]
+        _require(not empty, f"{self.name}: empty arrays", empty, "must have rows and columns", "leave them out")
+        ok = self.mm_per_px is None or isinstance(self.mm_per_px, numbers.Real)
+        _require(ok, f"{self.name}: mm_per_px", self.mm_per_px, "must be a number", "correct it, or leave it out")
+        told = self.camera.get("recording", {}) if isinstance(self.camera, Mapping) else None
+        ok = isinstance(told, Mapping) and isinstance(told.get("background"), str | None)
+        ok = ok and isinstance(told.get("left_out", 0), int)
+        _require(ok, f"{self.name}: camera", self.camera, "must map names, its `recording` too", "leave that out")
 
     @property
     def name(self) -> str:

@@ -10,7 +10,7 @@ from rich.table import Table
 from sensors_io.commands.choices import Bench, opened
 from sensors_io.commands.console import OUT
 from sensors_io.devices.base import Device
-from sensors_io.devices.errors import DeviceNotFoundError
+from sensors_io.devices.errors import DeviceDataError, DeviceNotFoundError
 
 _TIMEOUT_S = 2.0  # for one sample
 _SETTLE_S = 0.2  # samples taken before the sensor obeyed are on their way
@@ -56,7 +56,13 @@ def _mean_force(device: Device, seconds: float) -> np.ndarray:
     forces: list[np.ndarray] = []
     end_s = time.monotonic() + seconds
     while not forces or time.monotonic() < end_s:
-        forces.append(device.read(_TIMEOUT_S).arrays["force_n"])
+        sample = device.read(_TIMEOUT_S)
+        if "force_n" not in sample.arrays:
+            name = device.identity.sensor
+            raise DeviceDataError(
+                f"{name} sent a sample without force; let its program send it, and take the zero again"
+            )
+        forces.append(sample.arrays["force_n"])
     return np.mean(forces, axis=0)
 
 

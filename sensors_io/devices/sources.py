@@ -12,10 +12,11 @@ import numpy as np
 from sensors_io.clock import NS_PER_S
 from sensors_io.devices import tac3d_messages
 from sensors_io.devices.base import Identity
-from sensors_io.devices.errors import DeviceNotFoundError, StreamEndedError
+from sensors_io.devices.errors import DeviceDataError, DeviceNotFoundError, StreamEndedError
 from sensors_io.errors import path_text
 from sensors_io.importers.pictures import PictureError, below, read_picture
 from sensors_io.importers.video import is_cut_off
+from sensors_io.index import looks_like_records
 from sensors_io.records import RecordStore
 from sensors_io.schema import FRAME_ARRAYS, Flag, Sequence
 
@@ -107,26 +108,26 @@ class VideoFile:
         capture = self._open()
         try:
             count = time_ns = 0
-            last_ms = first_ms = 0.0
+            first_ms = last = 0.0
             stated = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
             while capture.grab():
                 ok, image = capture.retrieve()
                 if not ok:
                     break
-                last_ms = capture.get(cv2.CAP_PROP_POS_MSEC)
+                stamp_ms, last = capture.get(cv2.CAP_PROP_POS_MSEC), capture.get(cv2.CAP_PROP_PTS)
                 if count == 0:
-                    first_ms = last_ms
+                    first_ms = stamp_ms
                 else:
-                    own_ns = round((last_ms - first_ms) * 1e6)
+                    own_ns = round((stamp_ms - first_ms) * 1e6)
                     time_ns = own_ns if own_ns > time_ns else round(time_ns + NS_PER_S / self._rate_hz)
                 yield Recorded(time_ns=time_ns, index=count, frame=cv2.cvtColor(image, cv2.COLOR_BGR2RGB), arrays={})
                 count += 1
         finally:
             capture.release()
-        if is_cut_off(self.path, stated, count, self._rate_hz, last_ms):
+        if is_cut_off(self.path, stated, count, self._rate_hz, last):
             raise StreamEndedError(
-                f"{self.path} is cut off: {count} of {stated} frames could be decoded and were replayed; put a whole "
-                "copy back"
+                f"{self.path} is cut off: {count} of {max(stated, count + 1)} frames could be decoded and were "
+                "replayed; put a whole copy back"
             )
 
     def _open(self) -> cv2.VideoCapture:
@@ -213,10 +214,23 @@ class Tac3dRecording:
 
     @property
     def identity(self) -> Identity:
+        assert self._recorded is not None  # a reader takes what is raised later for a broken sample
         return Identity(sensor="tac3d", serial=self.path.stem, product="Tac3D recording", where=str(self.path))
 
+    @functools.cached_property
+    def _recorded(self) -> tac3d_messages.Tac3dArrays:
+        try:
+            recorded = tac3d_messages.load_recording(self.path)
+            tac3d_messages.to_schema({name: a[0] for name, a in recorded.matrices.items()})
+        except DeviceDataError as error:
+            raise DeviceNotFoundError(str(error)) from error
+        times = recorded.send_time_s
+        if len(times) > 1 and ((np.diff(times) < 0).any() or times[0] == times[-1]):
+            raise DeviceNotFoundError(f"{self.path}: sendTimestamp: must rise; replay another recording")
+        return recorded
+
     def samples(self) -> Iterator[Recorded]:
-        recorded = tac3d_messages.load_recording(self.path)
+        recorded = self._recorded
         start = recorded.send_time_s[0]
         for i, index in enumerate(recorded.index):
             fields = tac3d_messages.to_schema({name: a[i] for name, a in recorded.matrices.items()})
@@ -258,7 +272,7 @@ def source_of(
     """
     if not path.exists():
         raise DeviceNotFoundError(f"{path} does not exist; give a recording")
-    if (path / "index.json").is_file():
+    if looks_like_records(path):
         return RecordedContact(path=path, contact=contact, sensor=sensor)
     if path.suffix == ".npz" or (path / "index.npy").is_file():
         return Tac3dRecording(path=path)

@@ -11,7 +11,7 @@ from sensors_io.importers import pictures
 from sensors_io.importers.keep import Keep
 from sensors_io.importers.video import VideoError, read_video
 from sensors_io.importers.videos import SUFFIXES
-from sensors_io.index import INDEX
+from sensors_io.index import looks_like_records
 from sensors_io.quality import QualityConfig, time_gap
 from sensors_io.records import RecordStore
 from sensors_io.schema import Flag
@@ -97,7 +97,7 @@ def read_pictures(inputs: Sequence[pathlib.Path], sensor: str) -> PictureSequenc
 
 
 def _read(path: pathlib.Path, sensor: str) -> Iterator[_Shot]:
-    if (path / INDEX).exists():
+    if looks_like_records(path):
         yield from _records(path, sensor)
     elif path.is_dir():
         files = pictures.below(path, PICTURES)

@@ -1,5 +1,6 @@
 """Pictures of a folder as the frames of a sequence, each read whole or left out by name."""
 
+import collections
 import dataclasses
 import itertools
 import os
@@ -137,12 +138,32 @@ def numbered(folder: pathlib.Path, suffixes: tuple[str, ...] = (".jpg", ".jpeg",
 
 
 def inside(folder: pathlib.Path) -> Iterator[pathlib.Path]:
-    """All that lies below a folder, also behind links, but for hidden names: macOS writes ._a.png beside a.png."""
-    for place, folders, files in os.walk(folder, followlinks=True):
-        path, true = pathlib.Path(place), os.path.realpath(place)
-        above = {true, *map(str, pathlib.Path(true).parents)}  # a link back to one of them has no end
-        folders[:] = [f for f in folders if not f.startswith(".") and os.path.realpath(path / f) not in above]
-        yield from (path / name for name in (*folders, *files) if not name.startswith("."))
+    """All that lies below a folder, also behind links, but for hidden names: macOS writes ._a.png beside a.png.
+
+    A folder that several links lead to is given once, without a link where it can be.
+
+    Raises:
+      OSError: a folder that cannot be listed.
+    """
+    waiting, seen = collections.deque([folder] if folder.is_dir() else []), set[str]()
+    while waiting:
+        start = waiting.popleft()
+        for place, folders, files in os.walk(start, onerror=_raised):
+            path, true = pathlib.Path(place), os.path.realpath(place)
+            folders[:] = [f for f in folders if not f.startswith(".") and true not in seen]
+            if true in seen:
+                continue
+            seen.add(true)
+            above = set(map(str, pathlib.Path(true).parents))  # a link to one of them is none of the data's
+            links = (path / f for f in folders if (path / f).is_symlink())
+            waiting.extend(link for link in links if os.path.realpath(link) not in above)
+            yield from (path / name for name in files if not name.startswith("."))
+            if path != folder:
+                yield path
+
+
+def _raised(error: OSError) -> None:
+    raise error
 
 
 def below(folder: pathlib.Path, suffixes: Collection[str]) -> list[pathlib.Path]:

@@ -17,6 +17,7 @@ _MOST_STATED = 10**6  # frames that a header is believed
 _TIMED = (".mkv", ".webm")
 """Files that state no number of frames: OpenCV takes the duration of their longest stream times a rate."""
 _SOUND_S = 0.25  # by which sound may outlast the pictures
+_EBML, _SEGMENT = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67"  # the two elements of a Matroska file (RFC 9559)
 
 
 class VideoError(UnreadableError):
@@ -64,12 +65,13 @@ def read_video(path: pathlib.Path, keep: Keep) -> VideoFrames:
             raise VideoError(f"states a frame rate of {rate_hz}")
         expected = min(max(stated, 0), _MOST_STATED)
         frames, stamps_ms, size_px = _decode(capture, keep, keep.positions(expected))
+        last = capture.get(cv2.CAP_PROP_PTS)
     total = len(stamps_ms)
     if not total:
         raise VideoError("holds no frame that can be decoded")
-    if is_cut_off(path, stated, total, rate_hz, stamps_ms[-1]):
+    if is_cut_off(path, stated, total, rate_hz, last):
         sound = ", or its sound is longer" if path.suffix.lower() in _TIMED else ""
-        raise VideoError(f"is cut off{sound}: {total} of {stated} frames can be decoded")
+        raise VideoError(f"is cut off{sound}: {total} of {max(stated, total + 1)} frames can be decoded")
     kept = keep.positions(total)
     if total != expected:  # others than these were kept
         with _opened(path) as capture:
@@ -79,7 +81,7 @@ def read_video(path: pathlib.Path, keep: Keep) -> VideoFrames:
     return VideoFrames(frames=images, index=kept, time_ns=times, rate_hz=rate_hz, size_px=size_px, total=total)
 
 
-def is_cut_off(path: pathlib.Path, stated: int, count: int, rate_hz: float, last_ms: float) -> bool:
+def is_cut_off(path: pathlib.Path, stated: int, count: int, rate_hz: float, last: float) -> bool:
     """True if the end of a video is missing.
 
     Args:
@@ -87,11 +89,29 @@ def is_cut_off(path: pathlib.Path, stated: int, count: int, rate_hz: float, last
       stated: frames by its header.
       count: frames that can be decoded.
       rate_hz: that it states.
-      last_ms: stamp of the last frame.
+      last: stamp of the last frame, in periods of that rate since the start of the file.
     """
-    if count >= stated or path.suffix.lower() not in _TIMED:
+    if path.suffix.lower() not in _TIMED:
         return count < stated
-    return (stated - 1) / rate_hz - last_ms / 1e3 > _SOUND_S
+    return _lacks_bytes(path) or (count < stated and stated - 1 - last > _SOUND_S * rate_hz)
+
+
+def _lacks_bytes(path: pathlib.Path) -> bool:
+    """True if a Matroska file is shorter than its elements say."""
+    end = 0
+    with path.open("rb") as file:
+        for kind in (_EBML, _SEGMENT):
+            file.seek(end)
+            if file.read(4) != kind:
+                return False  # another container by this name
+            if not (first := file.read(1)):
+                return True
+            bits = 7 * (9 - first[0].bit_length())  # as many bytes as there are zeros before the first one, and one
+            size = int.from_bytes(first + file.read(bits // 7 - 1)) & ((1 << bits) - 1)
+            if size == (1 << bits) - 1:
+                return False  # written without going back, as a recorder that is killed leaves it
+            end = file.tell() + size
+    return path.stat().st_size < end
 
 
 def _times_ns(stamps_ms: np.ndarray, rate_hz: float) -> np.ndarray:

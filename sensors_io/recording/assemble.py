@@ -226,7 +226,8 @@ class _Force:
         )
         time, order = np.unique(time, return_index=True)  # records of a datagram that was held up overlap the next
         try:
-            found = at_frames(time_ns, time, np.concatenate([force, moment], -1)[order].astype(np.float64))
+            with np.errstate(invalid="ignore"):  # readings that are not finite: `_mend` flags their frames
+                found = at_frames(time_ns, time, np.concatenate([force, moment], -1)[order].astype(np.float64))
         except ForceError:  # killed before three readings: no force, and every frame says so
             return cls(arrays={}, uncovered=~nowhere, out_of_range=nowhere, residual_n=None)
         after = np.clip(np.searchsorted(time, time_ns), 1, len(time) - 1)
@@ -235,7 +236,7 @@ class _Force:
             arrays={"force_n": values[:, :3], "moment_nmm": values[:, 3:], "force_time_ns": found.time_ns},
             uncovered=~found.covered,
             out_of_range=beyond[order][after] | beyond[order][after - 1],
-            residual_n=float(found.residual.max()),
+            residual_n=float(found.residual[np.isfinite(found.residual)].max(initial=0.0)),
         )
 
 

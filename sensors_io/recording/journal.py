@@ -170,4 +170,4 @@ def _decode(body: memoryview) -> JournalEntry:
         dtype, count = np.dtype(kind), int(np.prod(shape))
         arrays[name] = np.frombuffer(body, dtype, count, start).reshape(shape) if count else np.zeros(shape, dtype)
         start += count * dtype.itemsize
-    return JournalEntry(kind=header["kind"], plain=header["plain"], arrays=arrays)
+    return JournalEntry(kind=header["kind"], plain=dict(header["plain"]), arrays=arrays)

@@ -21,14 +21,16 @@ from sensors_io.devices.errors import DeviceError, StreamEndedError
 from sensors_io.devices.intake import Counts
 from sensors_io.force import ForceError, GravityModel, Mount
 from sensors_io.index import JOURNALS
+from sensors_io.recording.assemble import background_name
 from sensors_io.recording.book import Book, ObjectView, Report
 from sensors_io.recording.coach import Advice, Coach, CoachConfig, ContactStage, FreeCoach, protocol
 from sensors_io.recording.journal import JournalWriter
 from sensors_io.recording.streams import SampleReader, Stream, StreamStatus
 from sensors_io.records import RecordsMeta, RecordWriter
-from sensors_io.schema import ContactKey, Phase, SchemaError
+from sensors_io.schema import MOTIONS, ContactKey, Phase, SchemaError
 
 _UNTOUCHED_S = 10.0  # of a pause before the first touch the last 10 to 20 s are kept: contacts are stored from memory
+_NAME_BYTES = 255  # of a file, in the common file systems
 _IDLE_S = 0.002  # between looks at the devices; a tenth of the fastest camera's period
 
 
@@ -109,6 +111,8 @@ def record_session(
       DeviceError: a device failed for good; what was recorded is in the records.
     """
     streams = tuple(Stream(i, feed, config.late_s.get(feed.identity.sensor, 0.0)) for i, feed in enumerate(tactile))
+    for stream in streams:
+        _require_short_names(config, stream.sensor)
     report = Report()
     with RecordWriter(out, meta=_meta(config, streams), resume=True) as writer:
         journals = out / JOURNALS
@@ -130,6 +134,17 @@ def record_session(
 
 def _stages(config: SessionConfig) -> tuple[ContactStage, ...]:
     return (ContactStage(motion="free", force_n=0.0),) if config.free_s > 0 else config.stages
+
+
+def _require_short_names(config: SessionConfig, sensor: str) -> None:
+    """Refuse names of which a file could not be named before anything is recorded."""
+    key = ContactKey(object_id=config.object_id, site=config.site, motion=max(MOTIONS, key=len), trial=99)
+    rest = len(background_name(key, sensor).with_suffix(".tmp.png").name) - len(config.object_id) - len(sensor)
+    if len(config.object_id) + len(sensor) > _NAME_BYTES - rest:
+        raise SchemaError(
+            f"object_id and sensor have {len(config.object_id)} and {len(sensor)} letters: must have at most "
+            f"{_NAME_BYTES - rest} together, since files are named by them; shorten them"
+        )
 
 
 def _meta(config: SessionConfig, streams: Seq[Stream]) -> RecordsMeta:
@@ -249,9 +264,10 @@ class _Session:
         times = np.array([s.host_time_ns for s in samples], np.int64)
         force, moment = _stacked(samples, "force_n"), _stacked(samples, "moment_nmm", lacking=0.0)
         beyond = np.array([bool(s.arrays.get("out_of_range", False)) for s in samples], bool)
-        if self._config.gravity is not None:
-            force, moment = self._config.gravity.contact(force, moment, self._config.down)
-        force, moment = self._config.mount.to_gel(force, moment)
+        with np.errstate(invalid="ignore"):  # of readings that are not finite, which are journaled as they are
+            if self._config.gravity is not None:
+                force, moment = self._config.gravity.contact(force, moment, self._config.down)
+            force, moment = self._config.mount.to_gel(force, moment)
         if samples:
             journal.append("force", {}, time_ns=times, force_n=force, moment_nmm=moment, out_of_range=beyond)
             self._alarm = "the force sensor is out of its range: release" if beyond[-1] else ""

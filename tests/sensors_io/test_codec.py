@@ -108,6 +108,11 @@ def test_what_cannot_be_stored_is_refused():
     for gain in (np.float32(1), float("nan"), float("inf")):
         said = "settings cannot be stored as JSON"
         refused(SchemaError, said, codec.encode_sequence, sequence(camera={"gain": gain}))
+    for camera in (None, [], {"recording": None}, {"recording": {"background": 3}}, {"recording": {"left_out": "3"}}):
+        refused(SchemaError, "camera is .* must map names", sequence, camera=camera)
+    refused(SchemaError, "mm_per_px is '.1': must be a number", sequence, mm_per_px=".1")
+    fields = dict.fromkeys(("deformation_mm", "shear_mm", "valid"))
+    refused(SchemaError, "must have rows and", sequence, depth_mm=np.zeros((12, 0, 0), np.float32), **fields)
 
 
 @hypothesis.given(st.data())

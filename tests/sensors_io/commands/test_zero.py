@@ -36,3 +36,10 @@ def test_a_drifted_sensor_reads_zero_afterwards(monkeypatch, capsys):
     rows = [line for line in capsys.readouterr().out.splitlines() if "tac3d" in line]
     assert len(rows) == 2
     assert all("+0.000 +0.000 -0.400" in row and row.count("+0.000 +0.000 +0.000") == 1 for row in rows)
+
+
+def test_a_message_without_force_is_one_line(monkeypatch, capsys):
+    monkeypatch.setattr(Tac3dConfig, "open", lambda self: Drifted())
+    monkeypatch.setattr(Drifted, "read", lambda self, timeout_s: Sample(host_time_ns=0, arrays={}))
+    assert cli.main(["zero", "tac3d"]) == 1
+    assert "tac3d sent a sample without force" in capsys.readouterr().err

@@ -213,3 +213,17 @@ def test_an_incomplete_recording_is_refused(tmp_path):
 def test_a_recording_of_what_is_no_number_is_refused(tmp_path, changes):
     np.savez(tmp_path / "a.npz", **{"index": np.arange(3), "sendTimestamp": np.arange(3.0)} | changes)
     refused(DeviceDataError, next(iter(changes)), tac3d_messages.load_recording, tmp_path / "a.npz")
+    refused(DeviceNotFoundError, next(iter(changes)), lambda: Tac3dRecording(path=tmp_path / "a.npz").identity)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"sendTimestamp": np.array([0.0, 2.0, 1.0])}, "sendTimestamp: must rise"),
+        ({"sendTimestamp": np.ones(3)}, "sendTimestamp: must rise"),
+        ({"3D_Displacements": np.zeros((3, 399, 3))}, "1197 numbers: must have 1200"),
+    ],
+)
+def test_a_recording_that_cannot_be_replayed_is_refused_before_it_is(tmp_path, changes, said):
+    np.savez(tmp_path / "a.npz", **{"index": np.arange(3), "sendTimestamp": np.arange(3.0)} | changes)
+    refused(DeviceNotFoundError, said, lambda: Tac3dRecording(path=tmp_path / "a.npz").identity)

@@ -6,12 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
+from sensors_io.devices.sources import source_of
 from sensors_io.fields.deformation import DeformationReader
 from sensors_io.fields.evidence import Pattern
 from sensors_io.fields.extract import ExtractConfig, Extractor
 from sensors_io.fields.slopes import ColourMap
 from sensors_io.fields.sources import SourceError, read_pictures
 from sensors_io.fields.types import Calibration, CalibrationError, Fields
+from sensors_io.index import MissingIndexError
 from sensors_io.schema import Flag, SchemaError
 from tests.sensors_io.checks import refused
 
@@ -171,3 +173,8 @@ def test_what_is_no_picture_is_refused(tmp_path: pathlib.Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.random.default_rng(0).integers(0, 255, (40, 40, 3), np.uint8))
     (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:-200])
     refused(SourceError, "is cut off", read_pictures, [tmp_path], "x")
+    for lost in ("contacts-00000.arrayrecord", ".journals"):  # pictures beside records are not the recorded ones
+        (tmp_path / lost / "backgrounds").mkdir(parents=True)
+        (tmp_path / lost / lost).mkdir()
+        refused(MissingIndexError, "has no index.json", read_pictures, [tmp_path / lost], "x")
+        refused(MissingIndexError, "has no index.json", getattr, source_of(tmp_path / lost), "identity")

@@ -97,6 +97,9 @@ def test_links_are_followed_and_hidden_names_are_left_alone(tmp_path):
     (folder / "back").symlink_to(folder)
     picture(tmp_path / "elsewhere" / "deep" / "4.png")
     (folder / "linked").symlink_to(tmp_path / "elsewhere")
+    for link, target in (("latest", folder / "mug"), ("z", tmp_path / "elsewhere"), ("mug/l", tmp_path / "elsewhere")):
+        (folder / link).symlink_to(target)
+    (tmp_path / "elsewhere" / "to_mug").symlink_to(folder / "mug")  # each leads to the other, without end
     names = [path.relative_to(folder).as_posix() for path in below(folder, {".png"})]
     assert names == ["1.png", "linked/deep/4.png", "mug/3.png"]
     assert [path.name for path in numbered(folder)] == ["1.png"]

@@ -72,13 +72,22 @@ def test_a_video_of_uneven_times_is_whole_and_keeps_them(tmp_path, name, replay)
     np.testing.assert_array_equal(times_ns, np.array(UNEVEN_MS) * 1_000_000)
 
 
-@pytest.mark.parametrize(("sound_s", "whole"), [(2.1, True), (2.8, False)])
-def test_sound_may_last_a_little_longer(tmp_path, sound_s, whole):
-    path = uneven_film(tmp_path / "a.mkv", range(0, 2000, 40), sound_s)
+@pytest.mark.parametrize(("first_ms", "sound_s", "whole"), [(0, 2.1, True), (5000, 0.0, True), (0, 2.8, False)])
+def test_sound_may_last_a_little_longer_and_pictures_begin_late(tmp_path, first_ms, sound_s, whole):
+    path = uneven_film(tmp_path / "a.mkv", range(first_ms, first_ms + 2000, 40), sound_s)
     if whole:
         assert read_video(path, Keep(**WHOLE)).total == 50
-    else:
-        refused(VideoError, "is cut off, or its sound is longer", read_video, path, Keep(**WHOLE))
+        path.write_bytes(path.read_bytes()[:-1])
+    refused(VideoError, "is cut off, or its sound is longer", read_video, path, Keep(**WHOLE))
+
+
+def test_a_matroska_file_of_unknown_size_is_as_whole_as_its_frames(tmp_path):
+    """A recorder that is killed, or that writes into a pipe, leaves it."""
+    path = uneven_film(tmp_path / "a.mkv", range(0, 2000, 40))
+    segment, data = b"\x18\x53\x80\x67\x01", path.read_bytes()
+    at = data.index(segment) + len(segment)
+    path.write_bytes(data[:at] + b"\xff" * 7 + data[at + 7 :])
+    assert read_video(path, Keep(**WHOLE)).total == 50
 
 
 def test_a_long_video_takes_the_memory_of_the_frames_that_are_kept(tmp_path):

@@ -76,6 +76,31 @@ def test_a_force_that_is_missing_for_a_moment_lets_nothing_go(tmp_path, change):
     assert (report.contacts, report.incomplete) == (2, 0)
 
 
+class OddScale(Scale):
+    """A scale of which the readings of 50 ms are changed."""
+
+    def __init__(self, hand, change):
+        super().__init__(hand)
+        self.change = change
+
+    def drain(self):
+        odd = lambda sample: 200 * MS <= sample.host_time_ns - 10**9 < 250 * MS
+        return [self.change(sample) if odd(sample) else sample for sample in super().drain()]
+
+
+@pytest.mark.parametrize("name", ["force_n", "moment_nmm"])
+@pytest.mark.parametrize("value", [np.nan, -np.inf])
+def test_readings_of_a_force_sensor_that_are_not_finite_are_flagged_and_counted(tmp_path, name, value, recwarn):
+    hand = Hand()
+    force = OddScale(hand, with_arrays(**{name: np.full(3, value, np.float32)}))
+    record_session(tmp_path, FREE, [Camera(hand)], force, show=hand.show)
+    made = RecordStore(tmp_path).contact(0)["gelsight_mini"]
+    assert np.flatnonzero(made.flags & np.uint32(Flag.INCOMPLETE)).tolist() == [19, 20, 21, 22, 23]
+    assert made.camera["recording"]["broken"][name] == 5
+    assert made.camera["recording"]["force_residual_n"] == 0
+    assert not recwarn.list
+
+
 def test_samples_of_another_shape_are_left_out_and_counted(tmp_path):
     made = recorded(tmp_path, with_arrays(depth_mm=np.zeros((4, 4), np.float32)))
     assert made.camera["recording"]["left_out"] == 3
@@ -148,6 +173,7 @@ def test_forces_and_moments_past_16_bits_are_kept(tmp_path):
 @pytest.mark.parametrize(
     ("start", "said"),
     [
+        (3, "an entry of another layout"),
         ({"streams": [{}]}, "entries of another layout"),
         ({"streams": [{"identity": {}}], "key": {}}, "entries of another layout"),
         ({"key": {}, "identity": {}}, "earlier version"),
