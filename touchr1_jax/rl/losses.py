@@ -190,7 +190,7 @@ def too_far(algorithm: Algorithm, log_ratio: Float[Array, "*n T"], mask: Bool[Ar
 def mismatch_parts(
     gap: Float[Array, "P G T"], mask: Bool[Array, "P G T"], dropped: Bool[Array, "P G"]
 ) -> dict[str, Float[Array, "P"]]:
-    """Of each prompt: mean and largest |gap|, shares of rollouts dropped and learned from, whether tokens stay, exist."""
+    """Of each prompt: mean and largest |gap|, shares of rollouts dropped and learned from, if tokens stay, exist."""
     return {
         "sampler_gap": masked.mean_of_means(jnp.abs(gap), mask),
         "sampler_gap_peak": jnp.max(jnp.where(mask, jnp.abs(gap), 0.0), (-2, -1)),
