@@ -151,7 +151,8 @@ def heavy_tail(now: Metrics, start: Metrics) -> float | None:
 def entropy_collapse(now: Metrics, start: Metrics) -> float | None:
     """F9: entropy relative to the initial one, while answers have not improved and are not all right."""
     stuck = of_candidates(now, "accuracy") < min(of_candidates(start, "accuracy") + WORSE, 0.95)
-    return now["entropy"] / max(start["entropy"], 1e-6) if stuck else None
+    known = now.get("learned_share", 1.0) > 0  # the mean over no rollout is 0
+    return now["entropy"] / max(start["entropy"], 1e-6) if stuck and known else None
 
 
 def entropy_growth(now: Metrics, start: Metrics) -> float | None:

@@ -63,6 +63,7 @@ FAILURES = [  # each by less than its bound beyond it
     ("F13", {"drawn_gamed_share": 0.3}, 0.3),
     ("F15", {"nonfinite_share": 0.03}, 0.03),
     ("F15", {"nonfinite_share": 0.03, "drawn_nonfinite_share": 0.0}, 0.03),  # KL in the reward, of the selected alone
+    ("F15", {"learned_share": 0.0, "entropy": 0.0}, 0.0),
     ("F15", {"learned_share": 0.4}, 0.4),  # the others are cut off, or too far from the sampler
     ("F16", {"sampler_gap": 0.15}, 0.15),
 ]
