@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import re
 import sys
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # see `experiments.core.numerics`; read when NumPy is imported
@@ -64,7 +65,7 @@ def main() -> None:
         say(f"{type(error).__name__}: {error}: correct the path, its permissions, or free some space")
         status = 1
     except ValueError as error:
-        if "jax" in sys.modules:
+        if "jax" in sys.modules or not re.search(r"\bJAX_|\bjax_", str(error)):
             raise
         # its import ended, which reads them
         say(f"ValueError: {error}: a variable of the environment that begins with JAX_; correct it, or unset it")

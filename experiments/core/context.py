@@ -114,6 +114,7 @@ class Context:
 
     def ended(self, stage: str) -> None:
         """Keep the number and the checksum of the lines of a stage that has ended, for `require_log`."""
+        self.require_in_place()
         if self._log is not None:
             lines = self._log.by_stage().get(stage, [])
             write_sealed(self._stage_file(f"{_LOGGED}/{stage}"), {"lines": summary(lines)})
@@ -274,7 +275,7 @@ class Context:
         """
         if self.once(stage, lambda: here) != here:
             raise ConfigurationError(
-                f"{what} changed since this run began: put back what was there, or start a new run with --fresh"
+                f"{what} changed since this run began: put a copy of it back, or start anew with --fresh"
             )
 
     def cached_arrays(

@@ -79,7 +79,10 @@ class MetricLog:
     def require_in_place(self) -> None:
         """`UnwrittenError` if the file was moved or removed, as with its run: the rest would lie elsewhere."""
         with self._lock:
-            here = self._path.exists() and os.path.samestat(os.fstat(self._file.fileno()), self._path.stat())
+            try:
+                here = os.path.samestat(os.fstat(self._file.fileno()), self._path.stat())
+            except (OSError, ValueError):  # removed, or closed after an error
+                here = False
         if not here:
             raise UnwrittenError(f"{self._path} was moved or removed while its run goes on: put it back, then continue")
 

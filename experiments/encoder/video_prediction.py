@@ -96,9 +96,9 @@ class VideoPredictionConfig:
 
 def run(config: VideoPredictionConfig, context: Context) -> Results:
     """Train both predictors, score them and the baselines."""
+    require_encoder(config.encoder, context)
     data = open_touch(config.touch, config.frames, config.image_px, context)
     rows, test = data.training, data.parts["test"][: config.scored]
-    require_encoder(config.encoder, context)
     start = None if config.encoder is None else load_encoder(config.encoder)
     predictors = {name: train(config, name, data, rows, context, start) for name in (TOUCH, VISION)}
     params = jax.device_get(predictors[TOUCH].params["encoder"] if start is None else start.params)

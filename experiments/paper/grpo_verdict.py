@@ -89,6 +89,7 @@ class GrpoVerdictConfig(StudyConfig):
             raise ValueError(f"steps is {self.steps}: must hold one count for each of prompts {self.prompts}; set both")
         if not self.lr_scales or not self.presets:
             raise ValueError(f"lr_scales {self.lr_scales} and presets {self.presets} must not be empty; name some")
+        dataclasses.replace(self.grpo, algorithm=algorithm_of("dapo", exact=True))  # half of the arms enumerate levels
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

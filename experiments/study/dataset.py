@@ -1,6 +1,8 @@
 """The data of an experiment: contacts on disk, split by object into the parts that the stages use."""
 
 import dataclasses
+import hashlib
+import json
 import threading
 from collections.abc import Sequence
 from pathlib import Path
@@ -68,6 +70,13 @@ class Dataset:
             rows[a, : LEVELS[name]] = counts / counts.sum()
         return rows
 
+    def digest(self) -> str:
+        """First 16 hex digits of a SHA-256 of what is learned and scored: contacts, labels, and the split."""
+        parts = [rows.tolist() for rows in (self.training, self.parts["val"], self.parts["test"])]
+        keys = [str(key) for key in self.store.contacts]
+        content = json.dumps([keys, self.label.tolist(), self.visual_lies.tolist(), parts])
+        return hashlib.sha256(content.encode()).hexdigest()[:16]
+
     def summary(self) -> dict[str, Any]:
         """Counts for the report."""
         counts = {f"{part}_contacts": len(rows) for part, rows in self.parts.items()}
@@ -75,7 +84,7 @@ class Dataset:
         test = self.parts["test"]
         return counts | {
             "source": self.store.meta.source,
-            "records": self.store.digest,
+            "records": self.digest(),
             "sensors": list(self.clip.sensors),
             "frames_per_clip": self.clip.frames,
             "image_px": self.clip.image_px,

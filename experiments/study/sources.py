@@ -13,11 +13,9 @@ from experiments.core.context import Context
 from experiments.core.progress import ProgressCallback
 from sensors_io.generate import generate_records
 from sensors_io.importers.physiclear import PhysiclearConfig, import_physiclear
-from sensors_io.index import read_root
 from sensors_io.locks import RecordsBusyError
 from sensors_io.quality import oddities
 from sensors_io.records import RecordStore
-from sensors_io.remote import place
 from sensors_io.scenes.config import SceneConfig, config_hash
 
 Source = Literal["generated", "physiclear", "records"]
@@ -49,17 +47,13 @@ class SourceConfig:
 
 
 def prepare_records(config: SourceConfig, context: Context) -> Path:
-    """Directory of the records, made or imported first where the cache lacks them; an interrupted one resumes.
-
-    `ConfigurationError` for records that changed since the run began, as by further labels or contacts.
-    """
+    """Directory of the records, made or imported first where the cache lacks them; an interrupted one resumes."""
     if config.data_dir is None:
         path = context.cache_dir / f"scenes-{config_hash(config.scenes)}"
         make = functools.partial(generate_records, config.scenes, path)
         _make(context, "making scenes", lambda report: make(progress=report))
         return path
     if config.data == "records":
-        context.require_same("records", read_root(place(config.data_dir))[1], f"{config.data_dir}, the records,")
         return config.data_dir
     source, settings = config.data_dir.resolve(), config.physiclear
     identity = json.dumps([str(source), dataclasses.asdict(settings)], sort_keys=True)

@@ -20,7 +20,7 @@ from experiments.core import numerics, runs
 from experiments.core.artifacts import write_json
 from experiments.core.concurrency import concurrently, idle_cores
 from experiments.core.context import Context
-from experiments.core.errors import DataError
+from experiments.core.errors import ConfigurationError, DataError
 from experiments.study.cache import NEVER, fingerprint, source_digest
 from experiments.study.dataset import Dataset
 from experiments.study.seed import BLIND, CONTINUED, SFT, EvalVariant, SeedTraining
@@ -127,11 +127,12 @@ def run_study(
       variants: further evaluations of SFT, the control and the arms, by the names of their answers.
 
     Raises:
+      ConfigurationError: an algorithm that no arm uses, or as `require_encoder`.
       ValueError, RewardError, SizeError, EncoderError: as `check_arms`, `check_model` and `require_encoder`.
     """
     if arms.keys() <= algorithms.keys() and config.grpo.algorithm != Paper():
         given = preset_name(GRPOConfig(algorithm=config.grpo.algorithm))
-        raise ValueError(f"grpo.algorithm is {given}: no arm trains by it, for each has its own; leave it out")
+        raise ConfigurationError(f"grpo.algorithm is {given}: no arm trains by it, for each has its own; leave it out")
     check_arms({arm: {**weights, **config.more_rewards} for arm, weights in arms.items()}, variants)
     check_model(config.model, SENSORS)
     require_encoder(config.encoder, context)

@@ -170,6 +170,7 @@ def open_data(config: TrainingConfig, view_px: int, context: Context, at_once: i
 
     Raises:
       DataError: records of a sensor that answers cannot name.
+      ConfigurationError: other records than the run began with.
     """
     clip = ClipConfig(
         frames=config.model.frames,
@@ -186,6 +187,8 @@ def open_data(config: TrainingConfig, view_px: int, context: Context, at_once: i
     left_out = odd if config.drop_odd else ()
     grpo_share = GRPO_SHARE if config.recipe == "paper" else None
     data = open_dataset(path, clip, grpo_share, config.clip_memory_gib, config.read_threads, left_out)
+    where = hashlib.sha256(str(path).encode()).hexdigest()[:16]  # a run may read several
+    context.require_same(f"records/{where}", data.digest(), f"contacts, labels or splits of {path}, the records,")
     known = [sensor.name for sensor in TOUCH_LANGUAGE.sensors]
     if unknown := [name for name in data.clip.sensors if name not in known]:
         raise DataError(

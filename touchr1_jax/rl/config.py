@@ -375,7 +375,7 @@ class GRPOConfig:
             )
         cuts = f"top_p is {self.top_p}, min_p {self.min_p}"
         if self.algorithm.enumerated is not None and (self.top_p, self.min_p) != (1, 0):
-            raise ValueError(f"{cuts}: must be 1 and 0 where enumerated is set: levels are not drawn; change either")
+            raise ValueError(f"{cuts}: must be 1 and 0 where enumerated is set, which counts all levels; change either")
         if list(self.buckets) != sorted({n for n in self.buckets if 2 <= n < self.length}):
             raise ValueError(f"buckets is {self.buckets}: must ascend within 2 … {self.length - 1}; sort it")
 

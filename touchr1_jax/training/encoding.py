@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from touchr1_jax.models.load import WeightsError
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.stacked import layer_by_layer
@@ -25,20 +26,25 @@ def encode_contacts(fns: PolicyFns, params: Params, batches: Iterable[TouchBatch
     """Features of all contacts of some batches, in their order, on the host; a blind policy has no streams.
 
     Raises:
-      ValueError: features that are not finite, from which a policy would give the same answer to every question.
+      WeightsError: features that are not finite, from which a policy would give the same answer to every question.
     """
     encode, params = encode_program(fns, blind), committed(params)
-    found = [jax.device_get(encode(params, batch)) for batch in batches]
-    every: Features = jax.tree.map(lambda *x: np.concatenate(x), *found)
+    found, done = list[Features](), 0
+    for batch in batches:
+        found.append(jax.device_get(encode(params, batch)))
+        _require_finite(found[-1], done)
+        done += len(found[-1].stream_mask)
+    return jax.tree.map(lambda *x: np.concatenate(x), *found)
+
+
+def _require_finite(features: Features, before: int) -> None:
     for name in ("touch", "view"):
-        finite = np.isfinite(getattr(every, name).astype(np.float32)).reshape(len(every.stream_mask), -1).all(-1)
+        finite = np.isfinite(getattr(features, name).astype(np.float32)).reshape(len(features.stream_mask), -1).all(-1)
         if not finite.all():
-            raise ValueError(
-                f"{name} of contact {np.argmin(finite)} is encoded as numbers that are not finite, in "
-                f"{(~finite).sum()} of {len(finite)}: must be finite; correct its frames and force, or train the "
-                "encoder again"
+            raise WeightsError(
+                f"{name} of contact {before + np.argmin(finite)} among those to encode has numbers that are not finite:"
+                " must be finite; correct its frames and force, or train the encoder again"
             )
-    return every
 
 
 def touch_statistics(config: TactileViTConfig, batches: Iterable[TouchBatch]) -> TouchBatch:

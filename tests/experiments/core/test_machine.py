@@ -101,8 +101,8 @@ def test_processes_that_nobody_joins_say_so_and_end(process):
     assert done.returncode == 1
     with subprocess.Popen([sys.executable, "-c", code % 60], stderr=subprocess.PIPE) as waiting:
         waiting.stderr.readline()
-        waiting.send_signal(signal.SIGINT)
-        assert waiting.wait(20) == -signal.SIGINT
+        waiting.send_signal(signal.SIGTERM)
+        assert waiting.wait(20) == -signal.SIGTERM
 
 
 def test_the_parts_of_all_processes_are_what_one_makes(monkeypatch):

@@ -19,8 +19,9 @@ from experiments.study.training import open_data, require_encoder
 from sensors_io.commands.label import Label
 from sensors_io.importers.physiclear import PhysiclearConfig
 from sensors_io.locks import RecordsBusyError
-from sensors_io.records import RecordWriter
+from sensors_io.records import RecordStore, RecordWriter
 from sensors_io.scenes.config import SceneConfig, config_hash
+from sensors_io.schema import LEVELS
 from tests.experiments import tiny
 from tests.sensors_io import fakes
 from touchr1_jax.models.pretrained import PretrainedEncoder
@@ -37,18 +38,24 @@ def test_records_are_taken_as_they_are(records, context):
 def test_records_and_encoders_that_changed_end_a_continued_run(tmp_path, records, policy, params, context):
     copy, file = tmp_path / "copy", tmp_path / "encoder.npz"
     shutil.copytree(records, copy)
+    config = dataclasses.replace(tiny.STUDY, data="records", data_dir=copy)
+    card = RecordStore(copy).objects[RecordStore(copy).contacts[0].object_id]
+    level = card.label_row()[list(LEVELS).index("hardness")]
     encoder = PretrainedEncoder(
         config=policy.model.tactile, sensors=tuple(s.name for s in policy.language.sensors), params=params["tactile"]
     )
     for _ in range(2):
         file.write_bytes(encoder.to_bytes())
-        prepare_records(dataclasses.replace(GENERATED, data="records", data_dir=copy), context)
+        open_data(config, 16, context)
         require_encoder(file, context)
     table = tmp_path / "labels.csv"
-    table.write_text("object_id,hardness\ng000000,1\n")
-    assert Label(records=copy, labels=table, annotator="ada").run() == 0
+    for hardness, changes in ((level, False), ((level + 1) % 3, True)):
+        table.write_text(f"object_id,hardness\n{card.object_id},{hardness}\n")
+        assert Label(records=copy, labels=table, annotator="ada").run() == 0
+        if not changes:  # the index is another one, what it says is not
+            open_data(config, 16, context)
     with pytest.raises(ConfigurationError, match=r"copy, the records, changed since this run began: .* --fresh"):
-        prepare_records(dataclasses.replace(GENERATED, data="records", data_dir=copy), context)
+        open_data(config, 16, context)
     changed = dataclasses.replace(encoder, params=jax.tree.map(jnp.negative, encoder.params))
     file.write_bytes(changed.to_bytes())
     with pytest.raises(ConfigurationError, match=r"encoder\.npz, the encoder, changed since this run began"):

@@ -7,6 +7,7 @@ import pytest
 from sensors_io.schema import CLIP_ARRAYS
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.tiny import FNS
+from touchr1_jax.models.load import WeightsError
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.training.encoding import encode_contacts, noise_bank
 from touchr1_jax.types import TouchBatch
@@ -92,5 +93,5 @@ def test_a_contact_whose_features_are_not_finite_is_named():
     batches = [tiny.touch_batch(seed, 2) for seed in range(2)]
     assert len(encode_contacts(Pushed(**vars(FNS)), {}, batches).touch) == 4
     batches[1].force_n[0, 1, 0] = np.nan
-    with pytest.raises(ValueError, match="touch of contact 2 is encoded as numbers that are not finite, in 1 of 4"):
+    with pytest.raises(WeightsError, match="touch of contact 2 among those to encode has numbers that are not finite"):
         encode_contacts(Pushed(**vars(FNS)), {}, batches)
