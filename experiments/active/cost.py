@@ -91,7 +91,7 @@ def single_turn(
         mask=jnp.pad(jnp.asarray(batch.mask), beside, constant_values=True),
         target=batch.target,
     )
-    sampled = {"constrained": False, "enumerated": None, "learn_conclusion": True}
+    sampled: dict[str, Any] = {"constrained": False, "enumerated": None, "learn_conclusion": True}
     free: Any = dataclasses.replace(config.algorithm, **sampled, reference_every=None, reference_share=1.0)
     config = dataclasses.replace(config, algorithm=free)
     optimizer = optax.adamw(config.learning_rate)
