@@ -177,9 +177,9 @@ class Sequence:
         _require(not empty, f"{self.name}: empty arrays", empty, "must have rows and columns", "leave them out")
         ok = self.mm_per_px is None or isinstance(self.mm_per_px, numbers.Real)
         _require(ok, f"{self.name}: mm_per_px", self.mm_per_px, "must be a number", "correct it, or leave it out")
-        told = self.camera.get("recording", {}) if isinstance(self.camera, Mapping) else None
-        ok = isinstance(told, Mapping) and isinstance(told.get("background"), str | None)
-        ok = ok and isinstance(told.get("left_out", 0), int)
+        recording = self.camera.get("recording", {}) if isinstance(self.camera, Mapping) else None
+        ok = isinstance(recording, Mapping) and isinstance(recording.get("background"), str | None)
+        ok = ok and isinstance(recording.get("left_out", 0), int)
         _require(ok, f"{self.name}: camera", self.camera, "must map names, its `recording` too", "leave that out")
 
     @property

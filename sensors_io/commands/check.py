@@ -83,13 +83,16 @@ class Check:
                 OUT.print(f"not looked at: {count} sequences, {reason}", highlight=False)
         if not store.complete:
             problems.append(IncompleteRecordsError(f"{self.records}: its writing has not ended; run its command again"))
-        if journals := [*(self.records / JOURNALS).glob("*.journal"), *(self.records / JOURNALS).glob("*.refused")]:
+        if journals := [*(self.records / JOURNALS).glob("*.journal")]:
             problems.append(
                 IncompleteRecordsError(
                     f"{journals[0].parent} holds {len(journals)} contacts that are not in the records: the next "
-                    "`record` there brings in what a killed one left, and says what it refuses"
+                    "`record` there brings in what a killed one left"
                 )
             )
+        if kept := [*(self.records / JOURNALS).glob("*.refused")]:
+            words = "contacts that were refused when they were recorded; move them away or delete them"
+            OUT.print(f"{kept[0].parent} holds {len(kept)} {words}", markup=False, highlight=False, soft_wrap=True)
         for problem in problems:
             complain(problem)
         return 1 if problems else 0
@@ -116,5 +119,5 @@ def _counted(reasons: collections.Counter[str]) -> Table:
     return table
 
 
-_OTHERS = "frame recorded in another size than most of its contact"
+_OTHERS = "frame of another size or with other arrays than most of its contact"
 _MOST_REASONS = 12  # that are listed one by one

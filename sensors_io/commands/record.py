@@ -121,7 +121,11 @@ class Record(Bench):
             )
         OUT.print(f"{report.contacts} contacts written, {report.recovered} recovered, {report.incomplete} incomplete")
         for count, problem in (
-            (report.left_out, "were left out: their size differs from most of their contact; hold it, as by --width"),
+            (
+                report.left_out,
+                "were left out: their size or arrays differ from most of their contact; fix the size of the camera, as "
+                "with --width of uvc",
+            ),
             (report.broken, "hold values that no sensor measures: flagged incomplete"),
         ):
             if count:

@@ -233,7 +233,10 @@ class Replay:
             if first is not None and last is not None:  # the counter goes on: gaps of the recording stay gaps
                 base += last + 1 - first
             period = self.identity.period_s
-            shift_ns += last_ns + (last_ns - previous_ns if period is None else round(period * NS_PER_S))
+            round_ns = last_ns + (last_ns - previous_ns if period is None else round(period * NS_PER_S))
+            if round_ns <= 0:
+                raise StreamEndedError(f"{self.identity.where} lasts 0 s: cannot be repeated; leave out seconds")
+            shift_ns += round_ns
 
     def _sample(self, recorded: Recorded, time_ns: int, base: int) -> Sample:
         f = self._faults

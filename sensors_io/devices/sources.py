@@ -179,11 +179,8 @@ class RecordedContact:
                 "name one of these"
             )
         sequence = contact[self.sensor]
-        if (np.diff(sequence.host_time_ns) < 0).any():
-            raise DeviceNotFoundError(
-                f"{self.path}: the times of contact {self.contact} run backwards: must rise; replay another one"
-            )
-        return sequence
+        times = _rising(sequence.host_time_ns, f"{self.path}: contact {self.contact}", "ns")
+        return dataclasses.replace(sequence, host_time_ns=times)
 
     def samples(self) -> Iterator[Recorded]:
         s = self._sequence
@@ -214,7 +211,7 @@ class Tac3dRecording:
 
     @property
     def identity(self) -> Identity:
-        assert self._recorded is not None  # a reader takes what is raised later for a broken sample
+        _ = self._recorded  # read now: a reader takes what is raised later for a broken sample
         return Identity(sensor="tac3d", serial=self.path.stem, product="Tac3D recording", where=str(self.path))
 
     @functools.cached_property
@@ -224,10 +221,8 @@ class Tac3dRecording:
             tac3d_messages.to_schema({name: a[0] for name, a in recorded.matrices.items()})
         except DeviceDataError as error:
             raise DeviceNotFoundError(str(error)) from error
-        times = recorded.send_time_s
-        if len(times) > 1 and ((np.diff(times) < 0).any() or times[0] == times[-1]):
-            raise DeviceNotFoundError(f"{self.path}: sendTimestamp: must rise; replay another recording")
-        return recorded
+        times = _rising(recorded.send_time_s, f"{self.path}: sendTimestamp", "s")
+        return dataclasses.replace(recorded, send_time_s=times)
 
     def samples(self) -> Iterator[Recorded]:
         recorded = self._recorded
@@ -236,6 +231,20 @@ class Tac3dRecording:
             fields = tac3d_messages.to_schema({name: a[i] for name, a in recorded.matrices.items()})
             time_ns = round((recorded.send_time_s[i] - start) * NS_PER_S)
             yield Recorded(time_ns=time_ns, index=int(index), frame=None, arrays=fields)
+
+
+def _rising(times: np.ndarray, where: str, unit: str) -> np.ndarray:
+    """Times [N], where one that runs back, as of two messages that were swapped, is the latest before it.
+
+    Raises:
+      DeviceNotFoundError: the last is not after the first.
+    """
+    if len(times) > 1 and not times[-1] > times[0]:
+        raise DeviceNotFoundError(
+            f"{where}: row {len(times) - 1} has {times[-1]} {unit}, row 0 {times[0]} {unit}: the last must be after "
+            "the first; replay another recording"
+        )
+    return np.maximum.accumulate(times)
 
 
 def _read_picture(path: pathlib.Path) -> np.ndarray:

@@ -151,8 +151,9 @@ def _require_same_files(out: pathlib.Path, meta: RecordsMeta) -> None:
     before, now = Index.read(out).meta.notes, json.loads(json.dumps(meta.notes))
     if _IDENTITY in before and before[_IDENTITY] != now[_IDENTITY] and before["config"] == now["config"]:
         raise RecordsExistError(
-            f"{out} was imported with these options when the source had other files: the name, size or time of change "
-            f"of one differs, or a table; choose another directory, or delete {out} to import it anew"
+            f"{out} was imported with these options when the source had other files, or by an earlier version, which "
+            "read hidden files and no links: the name, size or time of change of one differs, or a table; choose "
+            f"another directory, or delete {out} to import it anew"
         )
 
 

@@ -143,7 +143,8 @@ def inside(folder: pathlib.Path) -> Iterator[pathlib.Path]:
     A folder that several links lead to is given once, without a link where it can be.
 
     Raises:
-      OSError: a folder that cannot be listed.
+      ImportSourceError: a folder that may not be listed.
+      OSError: one that cannot be listed for another reason.
     """
     waiting, seen = collections.deque([folder] if folder.is_dir() else []), set[str]()
     while waiting:
@@ -163,6 +164,11 @@ def inside(folder: pathlib.Path) -> Iterator[pathlib.Path]:
 
 
 def _raised(error: OSError) -> None:
+    if isinstance(error, PermissionError):
+        raise ImportSourceError(
+            f"{error.filename} cannot be listed ({error.strerror}): all folders are searched; make it readable, or "
+            "move it away"
+        ) from error
     raise error
 
 

@@ -121,7 +121,10 @@ def read_journal(path: pathlib.Path) -> tuple[list[JournalEntry], int]:
     """
     with path.open("rb") as file:  # mapped: a long contact is gigabytes
         size = os.fstat(file.fileno()).st_size
-        data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if size else b""
+        try:
+            data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if size else b""
+        except OSError:  # a file system without maps
+            data = path.read_bytes()
     whole = list(_entries(path, memoryview(data)))
     end = whole[-1][1] if whole else 0
     return [entry for entry, _ in whole], size - end

@@ -75,7 +75,7 @@ def test_check_counts_flags_and_verifies(run, tmp_path):
     assert "contacts-00001.arrayrecord" in err
 
 
-def test_what_a_recording_leaves_out_is_told_and_checked(run, tmp_path):
+def test_record_and_check_count_what_a_recording_leaves_out(run, tmp_path):
     """A camera that is plugged in again comes back with its own size; a killed session leaves a journal."""
     for n in range(12):
         picture(tmp_path / "shots" / f"{n}.png", shape=(10, 32) if n < 4 else (24, 32))
@@ -84,11 +84,14 @@ def test_what_a_recording_leaves_out_is_told_and_checked(run, tmp_path):
     _, _, err = run("list", out)
     assert "has no index.json: give the directory of a data set, or write one there first (a recording was" in err
     words = ["record", "--out", out, "--object-id", "cup", "--free-s", "0.4"]
-    status, told, _ = run(*words, "replay", "--path", tmp_path / "shots", "--seconds", "5")
+    status, said, _ = run(*words, "replay", "--path", tmp_path / "shots", "--seconds", "5")
     assert status == 0
-    assert "4 frames were left out: their size" in told
-    _, told, _ = run("check", out)
-    assert re.search(r"frame recorded in another size.* 4 ", told)
+    assert "4 frames were left out: their size or arrays differ from most of their contact; fix the size of the" in said
+    (out / ".journals" / "cup-0-free-0.refused").touch()
+    status, said, err = run("check", out)
+    assert (status, err) == (0, "")
+    assert re.search(r"frame of another size or with other arrays than.* 4 ", said)
+    assert "holds 1 contacts that were refused when they were recorded; move them away or delete them" in said
     (out / ".journals" / "cup-1-free-0.journal").touch()
     status, _, err = run("check", out)
     assert status == 1

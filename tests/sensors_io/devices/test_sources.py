@@ -54,15 +54,28 @@ def test_a_contact_of_records_with_all_of_its_arrays(tmp_path):
         ReplayConfig(path=tmp_path, sensor="dmtac").open(JumpingClock()).__enter__().read(1.0)
 
 
-def test_records_without_rising_times_are_replayed_at_once_or_named(tmp_path):
-    for name, time_ns in (("still", np.zeros(12, np.int64)), ("back", -np.arange(12))):
+def test_records_without_rising_times_are_named_and_single_ones_that_run_back_are_held(tmp_path):
+    for name, time_ns in (
+        ("still", np.zeros(12, np.int64)),
+        ("back", -np.arange(12)),
+        ("swapped", np.array([0, 1, 3, 2, *range(4, 12)])),
+    ):
         with RecordWriter(tmp_path / name, meta=records.META) as writer:
             writer.write_object(records.card())
             writer.write_contact([records.sequence(host_time_ns=time_ns)])
-    device = ReplayConfig(path=tmp_path / "still").open(JumpingClock())
-    assert (len(everything(device)), device.identity.period_s) == (12, None)
-    back = RecordedContact(path=tmp_path / "back")
-    refused(DeviceNotFoundError, "the times of contact 0 run backwards", lambda: back.identity)
+    for name, said in (("still", "row 11 has 0 ns, row 0 0 ns"), ("back", "row 11 has -11 ns, row 0 0 ns")):
+        source = RecordedContact(path=tmp_path / name)
+        refused(DeviceNotFoundError, f"contact 0: {said}: the last must", lambda s=source: s.identity)
+    samples = everything(ReplayConfig(path=tmp_path / "swapped").open(JumpingClock()))
+    assert [s.host_time_ns for s in samples] == [0, 1, 3, 3, *range(4, 12)]
+
+
+def test_a_single_sample_without_a_period_is_not_repeated_without_end(tmp_path):
+    np.savez(tmp_path / "a.npz", index=np.zeros(1), sendTimestamp=np.ones(1))
+    assert len(everything(ReplayConfig(path=tmp_path / "a.npz").open(JumpingClock()))) == 1
+    with ReplayConfig(path=tmp_path / "a.npz", seconds=1).open(JumpingClock()) as device:
+        device.read(1.0)
+        refused(StreamEndedError, "seconds", device.read, 1.0)
 
 
 def test_gaps_of_records_stay_gaps(tmp_path):

@@ -219,11 +219,17 @@ def test_a_recording_of_what_is_no_number_is_refused(tmp_path, changes):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"sendTimestamp": np.array([0.0, 2.0, 1.0])}, "sendTimestamp: must rise"),
-        ({"sendTimestamp": np.ones(3)}, "sendTimestamp: must rise"),
+        ({"sendTimestamp": np.array([0.0, 2.0, -1.0])}, "sendTimestamp: row 2 has -1.0 s, row 0 0.0 s: the last must"),
+        ({"sendTimestamp": np.ones(3)}, "sendTimestamp: row 2 has 1.0 s, row 0 1.0 s: the last must"),
         ({"3D_Displacements": np.zeros((3, 399, 3))}, "1197 numbers: must have 1200"),
     ],
 )
 def test_a_recording_that_cannot_be_replayed_is_refused_before_it_is(tmp_path, changes, said):
     np.savez(tmp_path / "a.npz", **{"index": np.arange(3), "sendTimestamp": np.arange(3.0)} | changes)
     refused(DeviceNotFoundError, said, lambda: Tac3dRecording(path=tmp_path / "a.npz").identity)
+
+
+def test_messages_that_were_swapped_are_replayed_at_the_latest_time_so_far(tmp_path):
+    np.savez(tmp_path / "a.npz", index=np.array([4, 6, 5, 7]), sendTimestamp=np.array([0.0, 2.0, 1.0, 3.0]))
+    samples = list(Tac3dRecording(path=tmp_path / "a.npz").samples())
+    assert [(s.index, s.time_ns // 10**9) for s in samples] == [(4, 0), (6, 2), (5, 2), (7, 3)]

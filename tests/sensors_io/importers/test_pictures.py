@@ -1,5 +1,8 @@
 """Pictures are read whole or left out by name, and what they leave behind is marked as a gap."""
 
+import errno
+import os
+import pathlib
 import struct
 import zlib
 
@@ -87,6 +90,12 @@ def test_names_are_ordered_by_their_numbers(tmp_path):
     (tmp_path / "a10" / "1.png").touch()
     names = [path.relative_to(tmp_path).as_posix() for path in below(tmp_path, {".png"})]
     assert names[2:6] == ["frame_100.png", "a2/0.15.png", "a2/0.20.png", "a10/1.png"]
+    assert natural(tmp_path / "a2b") < natural(tmp_path / "a10b")
+    assert natural(tmp_path / "a٢b") < natural(tmp_path / "a10b") < natural(tmp_path / "a10²1")
+
+
+def test_frame_numbers_whose_times_64_bits_cannot_hold_are_refused():
+    refused(UnreadableError, "reach 3.33e\\+37, which 64 bits", nominal_ns, np.array([1, 10**30]), 30.0)
 
 
 def test_links_are_followed_and_hidden_names_are_left_alone(tmp_path):
@@ -103,9 +112,17 @@ def test_links_are_followed_and_hidden_names_are_left_alone(tmp_path):
     names = [path.relative_to(folder).as_posix() for path in below(folder, {".png"})]
     assert names == ["1.png", "linked/deep/4.png", "mug/3.png"]
     assert [path.name for path in numbered(folder)] == ["1.png"]
-    refused(UnreadableError, "reach 3.33e\\+37, which 64 bits", nominal_ns, np.array([1, 10**30]), 30.0)
-    assert natural(tmp_path / "a2b") < natural(tmp_path / "a10b")
-    assert natural(tmp_path / "a٢b") < natural(tmp_path / "a10b") < natural(tmp_path / "a10²1")
+
+
+def test_a_folder_that_cannot_be_listed_is_named(tmp_path, monkeypatch):
+    """As lost+found, which only its owner reads."""
+    (tmp_path / "lost+found").mkdir()
+    listed = os.scandir
+    denied = PermissionError(errno.EACCES, "Permission denied", str(tmp_path / "lost+found"))
+    deny = lambda path: listed(path) if pathlib.Path(path) == tmp_path else (_ for _ in ()).throw(denied)
+    monkeypatch.setattr(os, "scandir", deny)
+    said = "lost.found cannot be listed .Permission denied.: .* make it readable, or move it away"
+    refused(ImportSourceError, said, below, tmp_path, {".png"})
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """A journal cut off anywhere is readable up to there; one damaged inside is refused."""
 
+import errno
+import mmap
 import tracemalloc
 
 import numpy as np
@@ -24,6 +26,14 @@ def test_entries_come_back(journal):
     assert [e.plain["n"] for e in entries] == [0, 1, 2, 3]
     assert entries[2].arrays["frame"].tolist() == [[2] * 3] * 2
     assert entries[2].arrays["empty"].shape == (0, 3)
+
+
+def test_a_journal_is_read_where_files_cannot_be_mapped(journal, monkeypatch):
+    def no_map(*args, **kwargs):
+        raise OSError(errno.ENODEV, "No such device")
+
+    monkeypatch.setattr(mmap, "mmap", no_map)
+    test_entries_come_back(journal)
 
 
 def test_a_long_journal_is_not_held_in_memory(tmp_path):

@@ -157,7 +157,7 @@ def test_two_sensors_make_one_contact_on_one_clock(tmp_path):
     assert first[1] - first[0] == 30 * MS
 
 
-def test_a_sensor_that_gives_nothing_is_told(tmp_path):
+def test_a_sensor_that_gives_nothing_is_counted(tmp_path):
     class Silent(Camera):
         def drain(self):
             return []
