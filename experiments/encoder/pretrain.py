@@ -13,7 +13,7 @@ import numpy as np
 
 from experiments.core.context import Context
 from experiments.core.loops import run_loop
-from experiments.study.dataset import Dataset, open_dataset
+from experiments.study.dataset import Dataset, open_dataset, require_same_records
 from experiments.study.sources import SourceConfig, prepare_records
 from sensors_io.pipeline import ClipConfig, ClipMemory, Contacts, clip_batches
 from sensors_io.scenes.config import SceneConfig
@@ -56,7 +56,9 @@ def open_touch(
 ) -> Dataset:
     """The records, made first if the cache lacks them; frames past the strain limit stay in, as in the studies."""
     clip = ClipConfig(frames=frames, image_px=image_px, rejected=(Flag.NOT_CONVERGED, Flag.SATURATED))
-    return open_dataset(prepare_records(config, context), clip, 0.5, memory_gib)
+    data = open_dataset(prepare_records(config, context), clip, 0.5, memory_gib)
+    require_same_records(data, context)
+    return data
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

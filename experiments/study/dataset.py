@@ -11,6 +11,7 @@ from typing import Any
 import grain
 import numpy as np
 
+from experiments.core.context import Context
 from experiments.core.errors import DataError
 from sensors_io.pipeline import ClipConfig, ClipMemory, clip_batches
 from sensors_io.records import RecordStore
@@ -90,6 +91,13 @@ class Dataset:
             "image_px": self.clip.image_px,
             "test_visual_lie_share": float(self.visual_lies[test].mean()),
         }
+
+
+def require_same_records(data: Dataset, context: Context) -> None:
+    """`ConfigurationError` if contacts, labels or splits changed since the run began."""
+    path = str(data.store.path)
+    where = hashlib.sha256(path.encode()).hexdigest()[:16]  # a run may read several
+    context.require_same(f"records/{where}", data.digest(), f"contacts, labels or splits of {path}, the records,")
 
 
 def split_parts(store: RecordStore, grpo_share: float | None, left_out: Sequence[int] = ()) -> dict[str, np.ndarray]:

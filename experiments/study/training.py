@@ -11,7 +11,7 @@ from experiments.core.concurrency import SEED_BYTES
 from experiments.core.context import Context
 from experiments.core.errors import DataError
 from experiments.core.memory import require_memory
-from experiments.study.dataset import Dataset, open_dataset
+from experiments.study.dataset import Dataset, open_dataset, require_same_records
 from experiments.study.sources import SourceConfig, odd_contacts, prepare_records
 from experiments.study.stages import StudySFT
 from sensors_io.pipeline import ClipConfig
@@ -187,8 +187,7 @@ def open_data(config: TrainingConfig, view_px: int, context: Context, at_once: i
     left_out = odd if config.drop_odd else ()
     grpo_share = GRPO_SHARE if config.recipe == "paper" else None
     data = open_dataset(path, clip, grpo_share, config.clip_memory_gib, config.read_threads, left_out)
-    where = hashlib.sha256(str(path).encode()).hexdigest()[:16]  # a run may read several
-    context.require_same(f"records/{where}", data.digest(), f"contacts, labels or splits of {path}, the records,")
+    require_same_records(data, context)
     known = [sensor.name for sensor in TOUCH_LANGUAGE.sensors]
     if unknown := [name for name in data.clip.sensors if name not in known]:
         raise DataError(
