@@ -107,6 +107,37 @@ def test_samples_of_another_shape_are_left_out_and_counted(tmp_path):
     assert np.flatnonzero(made.flags & np.uint32(Flag.TIME_GAP)).tolist() == [19]
 
 
+class Partly(Camera):
+    """A camera that gives its frames for some numbers alone."""
+
+    def __init__(self, hand, there):
+        super().__init__(hand, "digit")
+        self.there = there
+
+    def drain(self):
+        samples = super().drain()
+        return samples if self.there(self.count) else []
+
+
+@pytest.mark.parametrize(
+    ("there", "silent", "marked"),
+    [
+        (lambda n: n < 100, [False, True], [-1]),
+        (lambda n: n > 100, [True, False], [0]),
+        (lambda n: 40 < n < 160, [False, False], []),
+    ],
+)
+def test_a_sensor_that_is_silent_at_either_end_of_a_contact_is_flagged_and_counted(tmp_path, there, silent, marked):
+    hand = Hand()
+    config = dataclasses.replace(CONFIG, free_s=4.0)
+    report = record_session(tmp_path, config, [Camera(hand), Partly(hand, there)], None, show=hand.show)
+    assert +report.silent == ({"digit": 1} if any(silent) else {})
+    made = RecordStore(tmp_path).contact(0)["digit"]
+    assert [s > 1 for s in made.camera["recording"]["silent_s"]] == silent
+    gaps = np.flatnonzero(made.flags & np.uint32(Flag.TIME_GAP))
+    assert gaps.tolist() == [range(len(made))[n] for n in marked]
+
+
 def test_a_contact_that_cannot_be_stored_keeps_its_journal_and_later_sessions_go_on(tmp_path, monkeypatch):
     refuse = lambda writer, sequences: (_ for _ in ()).throw(SchemaError("frames is None: refused for the test"))
     kept = ["cup-0-press-0.refused", "cup-0-press-0.2.refused", "cup-0-press-0.3.refused"]
