@@ -1,5 +1,7 @@
 """Messages that break a protocol end no stream and are counted once."""
 
+import contextlib
+import socket
 import struct
 import time
 
@@ -8,11 +10,12 @@ import pytest
 
 from sensors_io.clock import JumpingClock
 from sensors_io.devices import tac3d_messages
-from sensors_io.devices.errors import WrongRateWarning
+from sensors_io.devices.errors import DeviceDataError, TwoSendersWarning, WrongRateWarning
 from sensors_io.devices.intake import Intake
 from sensors_io.devices.reader import Reader
 from sensors_io.devices.replay import Replay
 from sensors_io.devices.sources import Tac3dRecording
+from tests.sensors_io.checks import refused
 from tests.sensors_io.devices.fakes import sample, sent
 from tests.sensors_io.devices.test_netft import record, sensor
 from tests.sensors_io.devices.test_tac3d import datagrams, layout, listening, pushed
@@ -67,6 +70,39 @@ def test_two_programs_on_one_port_do_not_mix():
     found = [assembler.add(d, s) for pair in zip(a, b, strict=True) for d, s in zip(pair, "ab", strict=True)]
     serials = [tac3d_messages.Tac3dDecoder().decode(*whole).serial for whole in found if whole is not None]
     assert serials == ["A", "B"]
+
+
+def test_two_programs_behind_one_address_are_named():
+    assembler = tac3d_messages.Assembler()
+    ours, theirs = (datagrams(pushed([0, 0, -n], [0, 0, -n]), number=7, index=7) for n in (1, 2))
+    assert assembler.add(ours[0]) is assembler.add(ours[1]) is assembler.add(ours[1]) is None
+    refused(DeviceDataError, "packet 1 of message 7 came twice with other bytes", assembler.add, theirs[1])
+    assert [assembler.add(part) for part in ours[2:]] == [None, None]
+
+
+def test_a_second_program_of_one_serial_is_passed_over_until_the_first_is_silent(vendor):
+    sender, port = vendor
+    twin = lambda number: datagrams(pushed([0, 0, -2], [0, 0, -0.1]), number=number, index=number)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.connect(("127.0.0.1", port))
+        with contextlib.ExitStack() as first:
+            first.enter_context(sent(sender, message()))
+            with listening(port) as device, sent(other, twin):
+                pressed = lambda: float(device.read(5.0).arrays["force_n"][2])
+                with pytest.warns(TwoSendersWarning, match="send as this serial"):
+                    assert {pressed() for _ in range(20)} == {-1}
+                first.close()
+                assert any(pressed() == -2 for _ in range(200))
+
+
+@pytest.mark.parametrize("lost", [(), (3, 20)])
+def test_a_counter_that_restarts_without_a_silence_costs_a_quarter_of_a_second(lost):
+    intake = Intake(capacity=99, clock=JumpingClock())
+    numbers = [n for n in range(50) if n not in lost] + [*range(50)]
+    for k, number in enumerate(numbers):
+        intake.offer(sample(number, time_ms=30 * k))
+    late = len(lost)  # two of the numbers seem late
+    assert (intake.counts.restarts, intake.counts.duplicates, intake.counts.late) == (1, 8 - min(late, 1), min(late, 1))
 
 
 def test_a_layout_of_spaces_is_read_in_linear_time():
