@@ -61,7 +61,7 @@ class ClockMap:
         return host_ns if self.slow else device_ns + self._rising[0][1]
 
     def _judge(self, late_ns: int, host_ns: int) -> None:
-        """Take the delay of a sample into account; those that a stall held up have others beside them that came soon."""
+        """Take the delay of a sample into account; of those that a stall held up others came soon."""
         if self._least is None or host_ns >= self._until_ns:
             self.slow |= self._least is not None and self._least > self._LATE_NS
             self._least, self._until_ns = late_ns, host_ns + NS_PER_S

@@ -134,8 +134,8 @@ class Record(Bench):
             OUT.print(f"{sensor} gave no frame in {count} of {report.contacts} contacts", highlight=False)
         for sensor, count in (+report.silent).items():
             OUT.print(
-                f"{sensor} was silent at the beginning or end of {count} of {report.contacts} contacts: the frame beside "
-                "the gap is flagged time_gap; look at its connection",
+                f"{sensor} was silent at the beginning or end of {count} of {report.contacts} contacts: the frame "
+                "beside the gap is flagged time_gap; look at its connection",
                 highlight=False,
                 soft_wrap=True,
             )

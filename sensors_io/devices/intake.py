@@ -20,7 +20,13 @@ import numpy as np
 
 from sensors_io.clock import NS_PER_S, Clock
 from sensors_io.devices.base import Identity, Sample
-from sensors_io.devices.errors import DeviceError, DeviceTimeoutError, OverloadWarning, StaleFrameError, WrongRateWarning
+from sensors_io.devices.errors import (
+    DeviceError,
+    DeviceTimeoutError,
+    OverloadWarning,
+    StaleFrameError,
+    WrongRateWarning,
+)
 from sensors_io.sync import ClockMap, CounterStep, IndexGaps, PeriodGaps
 
 _ONLY_SEEN_NS = NS_PER_S // 4  # of nothing but numbers that were seen before: the counter began anew

@@ -23,7 +23,7 @@ PERIOD_S = 0.0327
 """Time between two messages of the vendor's recordings."""
 
 _LARGEST = 65_535  # bytes of a UDP datagram
-_SILENT_NS = round(3 * PERIOD_S * NS_PER_S)  # of the sender: another one of the same serial may be its program, started anew
+_SILENT_NS = round(3 * PERIOD_S * NS_PER_S)  # of a sender: then another one of its serial is taken
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -41,7 +41,8 @@ class ColourMap:
     position_degree: int
 
     def __post_init__(self) -> None:
-        places, colours = (math.comb(self.position_degree + 2, 2), math.comb(self.degree + 3, 3) - 1)  # not listed: a file states them
+        # numbers of terms, which are not listed: a file states the degrees
+        places, colours = math.comb(self.position_degree + 2, 2), math.comb(self.degree + 3, 3) - 1
         want = (places, colours, 2)
         if self.weights.shape != want or self.weights.dtype != np.float32:
             got = f"{self.weights.dtype}{list(self.weights.shape)}"

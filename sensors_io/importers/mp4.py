@@ -13,6 +13,7 @@ SUFFIXES = (".mp4", ".m4v", ".mov")
 
 _MOST = 10**6  # samples that a table is believed
 
+
 def is_cut_off(path: pathlib.Path, stated: int, count: int) -> bool:
     """True if the end of a video is missing, or pictures within it.
 
@@ -25,12 +26,11 @@ def is_cut_off(path: pathlib.Path, stated: int, count: int) -> bool:
       stated: pictures by OpenCV.
       count: pictures that can be decoded.
     """
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
-        with memoryview(mapped) as data:
-            try:
-                return _is_cut_off(data, stated, count)
-            except (*MALFORMED, StopIteration):
-                return count < stated
+    with path.open("rb") as file:
+        try:
+            return _is_cut_off(memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)), stated, count)
+        except (*MALFORMED, StopIteration):
+            return count < stated
 
 
 def _is_cut_off(data: memoryview, stated: int, count: int) -> bool:
@@ -40,7 +40,8 @@ def _is_cut_off(data: memoryview, stated: int, count: int) -> bool:
         *_, (last, _) = top = list(_boxes(data))
     except ValueError:
         return fragmented or count < stated  # else bytes may follow that are no box
-    track = next(body for kind, body in _boxes(moov) if kind == b"trak" and _at(body, b"mdia", b"hdlr")[8:12] == b"vide")
+    tracks = (body for kind, body in _boxes(moov) if kind == b"trak")
+    track = next(body for body in tracks if _at(body, b"mdia", b"hdlr")[8:12] == b"vide")
     if not fragmented:
         return count < min(stated, _untrimmed(track))
     if last != b"mfra":
