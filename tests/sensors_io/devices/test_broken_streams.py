@@ -118,14 +118,15 @@ def test_a_repeated_replay_keeps_the_gaps_of_the_recording(tmp_path):
         assert [device.read(1.0).index for _ in range(6)] == [3, 4, 7, 8, 9, 12]
 
 
-def test_a_record_that_another_overtook_is_no_wrong_rate():
+@pytest.mark.parametrize("waited", [0, 50])
+def test_a_record_that_another_overtook_or_that_waited_is_no_wrong_rate(waited):
     class OnTime(list):
-        """The record of each moment, 1,000 a second, the first two in the wrong order."""
+        """The record of each moment, 1,000 a second, the first two in the wrong order and late by some ms."""
 
         def __iter__(self):
             began = time.monotonic()
             for k in super().__iter__():
-                yield record(6 - k if k < 2 else 6 + round(1000 * (time.monotonic() - began)), *[0] * 6)
+                yield record(6 - k if k < 2 else 6 + waited + round(1000 * (time.monotonic() - began)), *[0] * 6)
                 time.sleep(0.005)
 
     with sensor(OnTime(range(80))) as (config, _), config.open() as device:
@@ -144,10 +145,10 @@ def test_a_wrong_rate_of_a_force_sensor_warns_and_leaves_its_stamps_out():
                 yield datagram
 
     with (
-        sensor(Slow(record(k, *[0] * 6) for k in range(60))) as (config, _),
+        sensor(Slow(record(k, *[0] * 6) for k in range(80))) as (config, _),
         config.open() as device,
         pytest.warns(WrongRateWarning, match="rate_hz is 1000"),
     ):
-        stamps = [device.read(5.0).device_time_ns for _ in range(60)]
+        stamps = [device.read(5.0).device_time_ns for _ in range(80)]
     assert stamps[0] == 0
     assert stamps[-5:] == [None] * 5
