@@ -101,6 +101,18 @@ def test_readings_of_a_force_sensor_that_are_not_finite_are_flagged_and_counted(
     assert not recwarn.list
 
 
+def test_a_force_sensor_that_falls_silent_raises_an_alarm(tmp_path):
+    class Silent(Scale):
+        def drain(self):
+            return [s for s in super().drain() if not 200 * MS <= s.host_time_ns - 10**9 < 1500 * MS]
+
+    hand = Hand()
+    assert record_session(tmp_path, SHORT, [Camera(hand)], Silent(hand), show=hand.show).contacts == 2
+    alarms = [status.alarm for status in hand.statuses]
+    assert sum(alarm.startswith("the force sensor is silent: release") for alarm in alarms) in range(20, 40)
+    assert alarms[-1] == ""
+
+
 def test_samples_of_another_shape_are_left_out_and_counted(tmp_path):
     made = recorded(tmp_path, with_arrays(depth_mm=np.zeros((4, 4), np.float32)))
     assert made.camera["recording"]["left_out"] == 3
