@@ -1,4 +1,4 @@
-"""Whether an MP4 or QuickTime file is whole, by its boxes (ISO/IEC 14496-12)."""
+"""Boxes of an MP4 or QuickTime file (ISO/IEC 14496-12), which tell whether it is whole."""
 
 import mmap
 import pathlib

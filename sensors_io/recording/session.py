@@ -244,9 +244,9 @@ class _Session:
     def _forces(self, looked: Seq[list[Sample]], journal: JournalWriter) -> tuple[np.ndarray, np.ndarray]:
         """Times [n] and forces [n, 3] on the gel: the force sensor's, else those that a tactile sensor tells."""
         if self._force is not None:
-            times, forces = self._measured(self._force.drain(), journal)
-            self._watch(times, looked)
-            return times, forces
+            measured = self._measured(self._force.drain(), journal)
+            self._watch(measured[0], looked)
+            return measured
         told = [i for i, samples in enumerate(looked) if samples and "force_n" in samples[0].arrays]
         if self._leads is None and told:
             self._leads = self._streams[told[0]]
