@@ -28,7 +28,7 @@ NO_LEAD = 0.04
 answers and from 640 under a control."""
 
 LEFT_OUT = "left_out_share"
-"""Share of the last `WINDOW` updates that were left out, for their gradient was not finite."""
+"""Share of the last `WINDOW` steps of which an update was left out, for it was not finite."""
 
 Metrics = Mapping[str, float]
 
@@ -183,7 +183,7 @@ def left_out_groups(now: Metrics, start: Metrics) -> float | None:
 
 
 def left_out_updates(now: Metrics, start: Metrics) -> float | None:
-    """F15: share of the last `WINDOW` updates that were left out because a gradient was not finite."""
+    """F15: share of the last `WINDOW` steps with an update that was left out, because it was not finite."""
     del start
     return now[LEFT_OUT]
 
@@ -324,7 +324,7 @@ RULES: tuple[AlarmRule, ...] = (
     ),
     AlarmRule(
         code="F15",
-        meaning="updates are skipped, because their gradient is not finite",
+        meaning="updates are skipped, because their gradient or the policy after them is not finite",
         bound=0.1,
         reason="one update in ten is lost; a single one may be a rare overflow",
         check=left_out_updates,
@@ -364,8 +364,9 @@ class AlarmMonitor:
 
         Args:
           metrics: of the step; empty where the update was `left_out`, whose metrics may not be finite.
-          left_out: the update was left out because its gradient was not finite.
+          left_out: an update was left out; also if `metrics` count one as `lost_updates`.
         """
+        left_out = left_out or metrics.get("lost_updates", 0.0) > 0
         self._left_out.append(left_out)
         at_once = {**metrics, LEFT_OUT: sum(self._left_out) / WINDOW}
         found = [rule.alarm(at_once, at_once) for rule in self._rules if rule.at_once]
