@@ -3,7 +3,8 @@
 The rules and bounds work as those of `alarms`, on the metrics of `active.exploration_metrics`.
 """
 
-from touchr1_jax.rl.alarms import RULES, AlarmRule, Metrics, of_candidates
+from touchr1_jax.rl.alarms import RULES, AlarmRule, Metrics, better
+from touchr1_jax.rl.alarms import untouched_share as untouched_prompts
 
 SHARED = ("F3", "F7", "F8", "F9", "F10", "F15", "F16")
 """Codes of the rules of `alarms` that hold for trajectories too."""
@@ -17,8 +18,7 @@ def untouched_share(now: Metrics, start: Metrics) -> float | None:
 
 def single_share(now: Metrics, start: Metrics) -> float | None:
     """Share of trajectories with one action although several are allowed, while answers do not improve."""
-    several = now["budget"] > 1 and of_candidates(now, "accuracy") <= of_candidates(start, "accuracy")
-    return now["one_action_share"] if several else None
+    return now["one_action_share"] if now["budget"] > 1 and not better(now, start) else None
 
 
 def full_share(now: Metrics, start: Metrics) -> float | None:
@@ -41,7 +41,7 @@ def silent_actions(now: Metrics, start: Metrics) -> float | None:
 
 
 ACTIVE_RULES: tuple[AlarmRule, ...] = (
-    *(rule for rule in RULES if rule.code in SHARED),
+    *(rule for rule in RULES if rule.code in SHARED and rule.check is not untouched_prompts),  # A1 counts these
     AlarmRule(
         code="A1",
         meaning="the policy never touches: lower the prices, or start from a policy that touches at random",

@@ -73,6 +73,11 @@ def of_candidates(metrics: Metrics, name: str) -> float:
     return metrics.get(f"drawn_{name}", metrics[name])
 
 
+def better(now: Metrics, start: Metrics) -> bool:
+    """True if more answers are right than at the start, beyond chance."""
+    return of_candidates(now, "accuracy") >= of_candidates(start, "accuracy") + WORSE
+
+
 def middle_excess(now: Metrics, start: Metrics) -> float:
     """F1: share of middle answers above the share of middle labels, whatever the number of levels."""
     del start
@@ -130,13 +135,10 @@ def _leads(now: Metrics) -> dict[str, float]:
 def idle_groups(now: Metrics, start: Metrics) -> float | None:
     """F7: share of groups of equal rewards among those that are not solved yet, while answers do not improve.
 
-    A group that is all right has nothing to learn, and alarm F15 counts those that are left out.  Under dynamic
-    sampling these are shares of all candidates (`drawn_…` in the log), because the selected groups hide those that
-    were not selected.
+    A group that is all right has nothing to learn, and alarm F15 counts those that are left out.  Shares are of all
+    candidates (`drawn_…` in the log), because selected groups hide the others.
     """
-    if "idle_share" not in now:  # no line of older logs has it
-        return None
-    if of_candidates(now, "accuracy") > of_candidates(start, "accuracy"):
+    if "idle_share" not in now or better(now, start):  # no line of older logs has the share
         return None
     unsolved = of_candidates(now, "unsolved_share")
     return of_candidates(now, "idle_share") / unsolved if unsolved > 0 else 0.0
@@ -171,6 +173,12 @@ def touched_share(now: Metrics, start: Metrics) -> float | None:
     """F10: share of the prompts that have any touch."""
     del start
     return now.get("touch_share")
+
+
+def untouched_share(now: Metrics, start: Metrics) -> float | None:
+    """F10: share of the prompts without touch, where others have some."""
+    del start
+    return 1 - now["touch_share"] if now.get("touch_share", 0.0) > 0 else None
 
 
 def left_out_groups(now: Metrics, start: Metrics) -> float | None:
@@ -302,6 +310,14 @@ RULES: tuple[AlarmRule, ...] = (
         at_once=True,
     ),
     AlarmRule(
+        code="F10",
+        meaning="prompts of a batch have no touch, others have",
+        bound=0.0,
+        reason="their answers are guesses, rewarded like the others",
+        check=untouched_share,
+        at_once=True,
+    ),
+    AlarmRule(
         code="F12",
         meaning="all frames have the same time index, so that shuffled frames test nothing",
         bound=0.01,
@@ -362,9 +378,7 @@ class AlarmMonitor:
     def update(self, metrics: Metrics, *, left_out: bool = False) -> list[Alarm]:
         """The alarms after one more step; before the first window is full, only those that judge single steps.
 
-        Args:
-          metrics: of the step; empty where the update was `left_out`, whose metrics may not be finite.
-          left_out: an update was left out; also if `metrics` count one as `lost_updates`.
+        Metrics of a step of which an update was `left_out`, or counted in `lost_updates`, may not be finite or empty.
         """
         left_out = left_out or metrics.get("lost_updates", 0.0) > 0
         self._left_out.append(left_out)
