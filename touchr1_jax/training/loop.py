@@ -294,9 +294,9 @@ class _LateLines:
         self._log(t, values)
         if in_a_row > self._most:
             raise NonFiniteGradientError(
-                f"step {t}: the gradient or the policy after it was not finite in {in_a_row} updates in a row, {skipped} "
-                f"in all; at most {self._most} in a row may be left out: lower the learning rate, or look at what the batches from "
-                f"step {t + 1 - in_a_row} on hold; nothing was saved since the last checkpoint"
+                f"step {t}: the gradient or the policy after it was not finite in {in_a_row} updates in a row, "
+                f"{skipped} in all; at most {self._most} in a row may be left out: lower the learning rate, or look at "
+                f"what the batches from step {t + 1 - in_a_row} on hold; nothing was saved since the last checkpoint"
             )
 
 
