@@ -3,7 +3,7 @@
 The rules and bounds work as those of `alarms`, on the metrics of `active.exploration_metrics`.
 """
 
-from touchr1_jax.rl.alarms import RULES, AlarmRule, Metrics, better
+from touchr1_jax.rl.alarms import RULES, AlarmRule, Metrics, of_candidates
 from touchr1_jax.rl.alarms import untouched_share as untouched_prompts
 
 SHARED = ("F3", "F7", "F8", "F9", "F10", "F15", "F16")
@@ -18,7 +18,8 @@ def untouched_share(now: Metrics, start: Metrics) -> float | None:
 
 def single_share(now: Metrics, start: Metrics) -> float | None:
     """Share of trajectories with one action although several are allowed, while answers do not improve."""
-    return now["one_action_share"] if now["budget"] > 1 and not better(now, start) else None
+    several = now["budget"] > 1 and of_candidates(now, "accuracy") <= of_candidates(start, "accuracy")
+    return now["one_action_share"] if several else None
 
 
 def full_share(now: Metrics, start: Metrics) -> float | None:

@@ -73,11 +73,6 @@ def of_candidates(metrics: Metrics, name: str) -> float:
     return metrics.get(f"drawn_{name}", metrics[name])
 
 
-def better(now: Metrics, start: Metrics) -> bool:
-    """True if more answers are right than at the start, beyond chance."""
-    return of_candidates(now, "accuracy") >= of_candidates(start, "accuracy") + WORSE
-
-
 def middle_excess(now: Metrics, start: Metrics) -> float:
     """F1: share of middle answers above the share of middle labels, whatever the number of levels."""
     del start
@@ -138,7 +133,9 @@ def idle_groups(now: Metrics, start: Metrics) -> float | None:
     A group that is all right has nothing to learn, and alarm F15 counts those that are left out.  Shares are of all
     candidates (`drawn_…` in the log), because selected groups hide the others.
     """
-    if "idle_share" not in now or better(now, start):  # no line of older logs has the share
+    if "idle_share" not in now:  # no line of older logs has it
+        return None
+    if of_candidates(now, "accuracy") > of_candidates(start, "accuracy"):
         return None
     unsolved = of_candidates(now, "unsolved_share")
     return of_candidates(now, "idle_share") / unsolved if unsolved > 0 else 0.0
