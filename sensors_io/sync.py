@@ -19,9 +19,14 @@ from sensors_io.clock import NS_PER_S
 class ClockMap:
     """Maps the stamps of one device to the host's clock by the running minimum of their difference.
 
+    A clock by which all samples of a second came over a quarter of a second late stands still or runs slow: its samples
+    have the time of their arrival from then on, until it restarts.
+
     Args:
       window_s: how long a difference is remembered.
     """
+
+    _LATE_NS = NS_PER_S // 4
 
     def __init__(self, window_s: float = 10.0):
         if window_s <= 0:
@@ -29,7 +34,10 @@ class ClockMap:
         self._window_ns = round(window_s * NS_PER_S)
         self._rising: collections.deque[tuple[int, int]] = collections.deque()  # (host, difference), both ascending
         self._last_device_ns: int | None = None
+        self._least: int | None = None  # delay of a sample since a second's beginning
+        self._until_ns = 0
         self.restarts = 0
+        self.slow = False
 
     def to_host_ns(self, device_ns: int, host_ns: int) -> int:
         """When a sample was taken, on the host's clock; never after it arrived.
@@ -40,6 +48,7 @@ class ClockMap:
         """
         if self._last_device_ns is not None and device_ns < self._last_device_ns:
             self._rising.clear()
+            self._least, self.slow = None, False
             self.restarts += 1
         self._last_device_ns = device_ns
         difference = host_ns - device_ns
@@ -48,7 +57,15 @@ class ClockMap:
         self._rising.append((host_ns, difference))
         while self._rising[0][0] < host_ns - self._window_ns:
             self._rising.popleft()
-        return device_ns + self._rising[0][1]
+        self._judge(difference - self._rising[0][1], host_ns)
+        return host_ns if self.slow else device_ns + self._rising[0][1]
+
+    def _judge(self, late_ns: int, host_ns: int) -> None:
+        """Take the delay of a sample into account; of those that a stall held up others came soon."""
+        if self._least is None or host_ns >= self._until_ns:
+            self.slow |= self._least is not None and self._least > self._LATE_NS
+            self._least, self._until_ns = late_ns, host_ns + NS_PER_S
+        self._least = min(self._least, late_ns)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -1,11 +1,11 @@
-"""Updates that are left out because their gradient is not finite, and their number."""
+"""Updates that are left out because their gradient, or the policy after them, is not finite, and their number."""
 
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
 
 class Skipping(NamedTuple):
@@ -40,6 +40,14 @@ def skip_nonfinite(optimizer: optax.GradientTransformation) -> optax.GradientTra
         )
 
     return optax.GradientTransformation(init, update)
+
+
+def count_lost(before: Any, after: Any, lost: Bool[Array, ""]) -> Any:
+    """The state `after` an update that was not taken where `lost`: one of `skip_nonfinite` counts it, others do not."""
+    if not isinstance(after, Skipping):
+        return after
+    in_a_row = jnp.where(lost, before.in_a_row + 1, after.in_a_row)
+    return after._replace(skipped=jnp.where(lost, before.skipped + 1, after.skipped), in_a_row=in_a_row)
 
 
 def count_skipped(state: Any) -> Int[Array, "2"] | None:

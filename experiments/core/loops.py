@@ -89,7 +89,7 @@ def stage_hooks(
 def _tell(context: Context, stage: str, times: LoopTime, left_out: float) -> None:
     """Keep and print how long the steps of a stage took, and say how many updates were left out."""
     if left_out:
-        context.print(f"{stage}: {left_out:.0f} updates were left out, for their gradient was not finite")
+        context.print(f"{stage}: {left_out:.0f} updates were left out, for they were not finite")
     if times.steps:
         context.add_time(f"{STEPPING}/{stage}", times.total_s)
         context.add_time(f"{WAITING}/{stage}", times.input_s)

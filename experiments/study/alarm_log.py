@@ -26,7 +26,8 @@ def alarm_log(
         alarms = monitor.update({} if left_out else metrics, left_out=left_out)
         notes = {f"{alarm.code} {alarm.meaning}": str(alarm) for alarm in alarms}
         if left_out:
-            notes[SKIPPED] = "the update is left out, for its gradient is not finite; the report counts all of them"
+            what = "the update is left out, for its gradient or the policy after it is not finite"
+            notes[SKIPPED] = f"{what}; the report counts all of them"
         for name, share in metrics.items():
             if name.startswith(NONFINITE_IN) and share > 0:
                 reward = name.removeprefix(NONFINITE_IN)

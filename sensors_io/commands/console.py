@@ -28,6 +28,8 @@ FIXES = {
     errno.ENOENT: "name a path that is there; a folder must stay while it is written",
     errno.ENOTDIR: "a file is in the place of a folder: move it away, or name another path",
     errno.EEXIST: "a file is in the place of a folder: move it away, or name another path",
+    errno.EISDIR: "a folder is in the place of a file: move it away, or name another path",
+    errno.ELOOP: "its symbolic links lead in a circle: correct them, or name another path",
     errno.ENAMETOOLONG: "name a shorter path",
     errno.EMFILE: "raise the limit of open files (ulimit -n)",
 }

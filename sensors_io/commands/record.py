@@ -132,6 +132,13 @@ class Record(Bench):
                 OUT.print(f"{count} frames {problem}", highlight=False, soft_wrap=True)
         for sensor, count in report.absent.items():
             OUT.print(f"{sensor} gave no frame in {count} of {report.contacts} contacts", highlight=False)
+        for sensor, count in (+report.silent).items():
+            OUT.print(
+                f"{sensor} was silent at the beginning or end of {count} of {report.contacts} contacts: the frame "
+                "beside the gap is flagged time_gap; look at its connection",
+                highlight=False,
+                soft_wrap=True,
+            )
         if report.given_up:
             stages = ", ".join(report.given_up)
             OUT.print(f"given up after {ATTEMPTS} attempts: {stages}; name another --site", soft_wrap=True)

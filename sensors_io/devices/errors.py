@@ -44,4 +44,8 @@ class OverloadWarning(UserWarning):
 
 
 class WrongRateWarning(UserWarning):
-    """A device that sends at another rate than it was said to."""
+    """A device that sends at another rate than it was said to, or whose clock runs at another."""
+
+
+class TwoSendersWarning(UserWarning):
+    """Two programs that send as one device."""

@@ -20,9 +20,16 @@ import numpy as np
 
 from sensors_io.clock import NS_PER_S, Clock
 from sensors_io.devices.base import Identity, Sample
-from sensors_io.devices.errors import DeviceError, DeviceTimeoutError, OverloadWarning, StaleFrameError
+from sensors_io.devices.errors import (
+    DeviceError,
+    DeviceTimeoutError,
+    OverloadWarning,
+    StaleFrameError,
+    WrongRateWarning,
+)
 from sensors_io.sync import ClockMap, CounterStep, IndexGaps, PeriodGaps
 
+_ONLY_SEEN_NS = NS_PER_S // 4  # of nothing but numbers that were seen before: the counter began anew
 _CLOCK_SET_NS = 10 * NS_PER_S  # between two clocks since the last sample: no buffer holds one back for so long
 
 
@@ -90,6 +97,7 @@ class Intake:
         self._index_gaps = IndexGaps()
         self._period_gaps: PeriodGaps | None = None
         self._stamps: tuple[int, int] | None = None  # of the last sample, on the device's clock and on the host's
+        self._new_ns = 0  # arrival of the last number that was not seen before
         self._away = False
         self._broken_since = 0  # the last whole sample
         self._warned_at = 0
@@ -260,6 +268,10 @@ class Intake:
         by_index = CounterStep(restarted=True)
         if sample.index is not None:
             by_index = self._index_gaps.step(sample.index, reopened=self._away)
+            if by_index.duplicate and sample.host_time_ns - self._new_ns > _ONLY_SEEN_NS:
+                by_index = self._index_gaps.step(sample.index, reopened=True)
+            if not (by_index.duplicate or by_index.late):
+                self._new_ns = sample.host_time_ns
         if self._period_gaps is None or by_index.duplicate or by_index.late:
             return by_index if sample.index is not None else CounterStep()
         by_period = self._by_period(self._period_gaps, sample)
@@ -293,5 +305,13 @@ class Intake:
     def _on_host_clock(self, sample: Sample) -> Sample:
         if sample.device_time_ns is None:
             return sample
+        told = self._clock_map.slow
         mapped = self._clock_map.to_host_ns(sample.device_time_ns, sample.host_time_ns)
+        if self._clock_map.slow and not told:
+            warnings.warn(
+                "the stamps of a device stand still, or run slower than this machine's clock: its samples are timed by "
+                "their arrival; look at the clock of its program",
+                WrongRateWarning,
+                stacklevel=3,
+            )
         return dataclasses.replace(sample, host_time_ns=mapped)

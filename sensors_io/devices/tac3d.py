@@ -3,6 +3,7 @@
 import dataclasses
 import socket
 import time
+import warnings
 from types import TracebackType
 from typing import Self
 
@@ -13,6 +14,7 @@ from sensors_io.devices.errors import (
     DeviceLostError,
     DeviceNotFoundError,
     DeviceTimeoutError,
+    TwoSendersWarning,
 )
 from sensors_io.devices.tac3d_messages import Assembler, Tac3dDecoder, to_schema
 
@@ -21,6 +23,7 @@ PERIOD_S = 0.0327
 """Time between two messages of the vendor's recordings."""
 
 _LARGEST = 65_535  # bytes of a UDP datagram
+_SILENT_NS = round(3 * PERIOD_S * NS_PER_S)  # of a sender: then another one of its serial is taken
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -54,6 +57,8 @@ class Tac3dSensor:
         self._socket: socket.socket | None = None
         self._decoder, self._assembler = Tac3dDecoder(), Assembler()
         self._sender: tuple[str, int] | None = None
+        self._heard_ns = 0  # when it sent last
+        self._warned = False
         self._serial = config.serial
         self._first: Sample | None = None
 
@@ -105,8 +110,8 @@ class Tac3dSensor:
                 continue
             if message.initialised < 100:  # its fields are not measured yet
                 starting = f"; its program has started to {message.initialised} %"
-            else:
-                self._serial, self._sender = message.serial, sender
+            elif not self._is_second(sender, stamp_ns):
+                self._serial, self._sender, self._heard_ns = message.serial, sender, stamp_ns
                 return Sample(
                     host_time_ns=stamp_ns,
                     device_time_ns=round(message.send_time_s * NS_PER_S),
@@ -114,13 +119,30 @@ class Tac3dSensor:
                     arrays=to_schema(message.matrices),
                 )
 
+    def _is_second(self, sender: tuple[str, int], stamp_ns: int) -> bool:
+        """True if a message comes from a second program of the same serial, which is passed over; warns once."""
+        if sender == self._sender or self._sender is None or stamp_ns - self._heard_ns > _SILENT_NS:
+            return False
+        if not self._warned:
+            warnings.warn(
+                f"Tac3D {self._serial}: {sender} and {self._sender} send as this serial to port {self._config.port}: "
+                f"only what {self._sender} sends is taken; end one of the programs",
+                TwoSendersWarning,
+                stacklevel=3,
+            )
+            self._warned = True
+        return True
+
     def _read_first(self, deadline: float) -> Sample:
         """The first whole message; broken ones before it are passed over."""
+        broken: DeviceDataError | None = None
         while True:
             try:
                 return self.read(max(deadline - time.monotonic(), 0.0))
-            except DeviceDataError:
-                continue
+            except DeviceDataError as error:
+                broken = error
+            except DeviceTimeoutError as silence:
+                raise DeviceTimeoutError(str(broken or silence)) from silence
 
     def take_zero(self) -> None:
         """Make the sensor take its present state as zero; nothing may touch it."""

@@ -187,7 +187,7 @@ class Assembler:
           sender: address that it came from; two programs on one port number their messages alike.
 
         Raises:
-          DeviceDataError: a datagram that is too short or numbers its packets wrongly.
+          DeviceDataError: a datagram that is too short, numbers its packets wrongly, or contradicts one before it.
         """
         if len(datagram) < _PACKET.size:
             raise DeviceDataError(f"Tac3D datagram of {len(datagram)} bytes: its header alone has {_PACKET.size}")
@@ -202,6 +202,12 @@ class Assembler:
         if parts[packet] is None:
             parts[packet] = datagram[_PACKET.size :]
             self._left[serial] -= 1
+        elif parts[packet] != datagram[_PACKET.size :]:  # else packets of two programs would make one message
+            del self._parts[serial], self._left[serial]
+            raise DeviceDataError(
+                f"Tac3D packet {packet} of message {message} came twice with other bytes: two programs send from one "
+                "address; let each send to a port of its own"
+            )
         if not self._left[serial]:
             del self._parts[serial], self._left[serial]
             whole = [part for part in parts if part is not None]

@@ -11,6 +11,7 @@ returns is linear in the normal; so steeper slopes than those calibrated on are 
 
 import dataclasses
 import itertools
+import math
 
 import cv2
 import numpy as np
@@ -40,7 +41,9 @@ class ColourMap:
     position_degree: int
 
     def __post_init__(self) -> None:
-        want = (len(position_terms(self.position_degree)), len(colour_terms(self.degree)), 2)
+        # numbers of terms, which are not listed: a file states the degrees
+        places, colours = math.comb(self.position_degree + 2, 2), math.comb(self.degree + 3, 3) - 1
+        want = (places, colours, 2)
         if self.weights.shape != want or self.weights.dtype != np.float32:
             got = f"{self.weights.dtype}{list(self.weights.shape)}"
             raise ValueError(f"weights is {got}: must be float32{list(want)}; fit it anew")

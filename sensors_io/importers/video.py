@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from sensors_io.errors import UserError, path_text
+from sensors_io.importers import mp4
 from sensors_io.importers.keep import LEAST_HZ, MOST_HZ, Keep, UnreadableError
 from sensors_io.importers.pictures import nominal_ns
 
@@ -91,6 +92,8 @@ def is_cut_off(path: pathlib.Path, stated: int, count: int, rate_hz: float, last
       rate_hz: that it states.
       last: stamp of the last frame, in periods of that rate since the start of the file.
     """
+    if path.suffix.lower() in mp4.SUFFIXES:
+        return mp4.is_cut_off(path, stated, count)
     if path.suffix.lower() not in _TIMED:
         return count < stated
     return _lacks_bytes(path) or (count < stated and stated - 1 - last > _SOUND_S * rate_hz)

@@ -20,6 +20,7 @@ from sensors_io.recording.journal import JournalEntry, JournalError, read_journa
 from sensors_io.schema import FRAME_ARRAYS, ContactKey, Flag, Sequence
 
 _GAP_PERIODS = 1.5  # between two frames: one is missing
+_SILENT_S = 1.0  # before the first frame or after the last of a contact: longer than a device is silent and not lost
 _INT64 = np.iinfo(np.int64)
 _MADE_HERE = ("frames", "host_time_ns", "device_time_ns", "force_time_ns", "target_force_n", "phase", "flags")
 
@@ -79,6 +80,7 @@ def _assembled(start: Mapping[str, Any], entries: Seq[JournalEntry], torn: int) 
         start=start,
         end=end,
         entries=entries,
+        span_ns=_span_ns(entries),
         backgrounds=backgrounds,
         absent=tuple(s["identity"]["sensor"] for s, f in zip(start["streams"], frames, strict=True) if not f),
     )
@@ -88,6 +90,13 @@ def _assembled(start: Mapping[str, Any], entries: Seq[JournalEntry], torn: int) 
         complete=bool(end and end["complete"]),
         torn_bytes=torn,
     )
+
+
+def _span_ns(entries: Seq[JournalEntry]) -> tuple[int, int]:
+    """First and last moment of a contact, by the phases and frames of all sensors, and the last one by the force."""
+    times = [e.plain["time_ns"] for e in entries if e.kind in ("phase", "frame")]
+    force = [int(e.arrays["time_ns"][-1]) for e in entries if e.kind == "force"]
+    return min(times), max(times + force)
 
 
 def background_name(key: ContactKey, sensor: str) -> pathlib.Path:
@@ -112,6 +121,7 @@ class _Shared:
     start: Mapping[str, Any]
     end: Mapping[str, Any] | None
     entries: Seq[JournalEntry]
+    span_ns: tuple[int, int]
     backgrounds: Mapping[str, np.ndarray]
     absent: tuple[str, ...]
 
@@ -124,6 +134,8 @@ class _Shared:
         time_ns = np.array([e.plain["time_ns"] for e in frames], np.int64)
         own = _own_arrays(frames)
         gaps = _gaps(time_ns, [e.plain["index"] for e in frames], identity["period_s"])
+        silent_s = self._silent_s(time_ns, identity["period_s"])
+        gaps[[0, -1]] |= [s > 0 for s in silent_s]
         force = _Force.at(time_ns, self.entries if number == 0 else ())
         flags = np.where(gaps | force.uncovered, np.uint32(Flag.TIME_GAP), np.uint32(0))
         arrays: dict[str, Any] = {**own, **force.arrays}
@@ -141,7 +153,11 @@ class _Shared:
             camera={
                 "settings": identity["settings"],
                 "recording": self._recording(stream, key, force.residual_n)
-                | {"left_out": given - len(frames), "broken": {name: int(rows.sum()) for name, rows in broken.items()}},
+                | {
+                    "left_out": given - len(frames),
+                    "broken": {name: int(rows.sum()) for name, rows in broken.items()},
+                    "silent_s": silent_s,
+                },
             },
             contact_region_px=None if region is None else tuple(region),
             mm_per_px=identity["mm_per_px"],
@@ -153,6 +169,11 @@ class _Shared:
             flags=flags,
             **arrays,
         )
+
+    def _silent_s(self, time_ns: np.ndarray, period_s: float | None) -> list[float]:
+        """Seconds without a frame at the beginning and the end of a contact; 0 where that is no gap."""
+        silent = (float(time_ns.min() - self.span_ns[0]) / NS_PER_S, float(self.span_ns[1] - time_ns.max()) / NS_PER_S)
+        return [s if s > max(_SILENT_S, 3 * (period_s or 0.0)) else 0.0 for s in silent]
 
     def _recording(self, stream: Mapping[str, Any], key: ContactKey, residual_n: float | None) -> dict[str, Any]:
         """Settings of the recording, as JSON."""

@@ -47,6 +47,7 @@ class Report:
       left_out: frames of another size or with other arrays than most of their contact.
       broken: frames with values that no sensor measures; they are flagged.
       absent: contacts in which a sensor of the session gave no frame, by its name.
+      silent: contacts at the beginning or end of which a sensor gave no frame for long, by its name.
       given_up: stages that `ATTEMPTS` contacts did not complete, in words.
     """
 
@@ -57,6 +58,7 @@ class Report:
     left_out: int = 0
     broken: int = 0
     absent: collections.Counter[str] = dataclasses.field(default_factory=collections.Counter)
+    silent: collections.Counter[str] = dataclasses.field(default_factory=collections.Counter)
     given_up: list[str] = dataclasses.field(default_factory=list)
 
 
@@ -123,7 +125,8 @@ class Book:
             self._writer.write_contact(found.sequences)
             self._report.contacts += 1
             self._report.absent.update(found.sequences[0].camera["recording"]["absent"])
-            for recording in (sequence.camera["recording"] for sequence in found.sequences):
+            for sensor, recording in ((sequence.sensor, sequence.camera["recording"]) for sequence in found.sequences):
+                self._report.silent[sensor] += any(recording["silent_s"])
                 self._report.left_out += recording["left_out"]
                 self._report.broken += max(recording["broken"].values(), default=0)
             if not found.complete:

@@ -24,6 +24,7 @@ from typing import Any, Self
 import numpy as np
 
 from sensors_io.errors import MALFORMED, UserError
+from sensors_io.json_files import require_regular
 
 _MAGIC = b"TJR1"
 _PREFIX = struct.Struct("<4sII")
@@ -117,8 +118,12 @@ def read_journal(path: pathlib.Path) -> tuple[list[JournalEntry], int]:
     """All whole entries, and the number of bytes of a last one that was cut off.
 
     Raises:
-      JournalError: an entry that is damaged though others follow it.
+      JournalError: an entry that is damaged though others follow it, or no file.
     """
+    try:
+        require_regular(path)
+    except ValueError as error:
+        raise JournalError(f"{path} is no journal ({error}): move it away") from error
     with path.open("rb") as file:  # mapped: a long contact is gigabytes
         size = os.fstat(file.fileno()).st_size
         try:

@@ -31,6 +31,7 @@ from sensors_io.schema import MOTIONS, ContactKey, Phase, SchemaError
 
 _UNTOUCHED_S = 10.0  # of a pause before the first touch the last 10 to 20 s are kept: contacts are stored from memory
 _NAME_BYTES = 255  # of a file, in the common file systems
+_SILENT_S = 1.0  # of the force sensor beside a camera that goes on
 _IDLE_S = 0.002  # between looks at the devices; a tenth of the fastest camera's period
 
 
@@ -176,6 +177,7 @@ class _Session:
         self._show, self._stop, self._book, self._region_px = show, stop, book, region_px
         self._leads: Stream | None = None
         self._alarm = ""
+        self._force_ns: int | None = None  # time of its last reading
 
     def contact(self, stage: ContactStage, key: ContactKey) -> None:
         """Record one contact from the prompt to the records."""
@@ -242,7 +244,9 @@ class _Session:
     def _forces(self, looked: Seq[list[Sample]], journal: JournalWriter) -> tuple[np.ndarray, np.ndarray]:
         """Times [n] and forces [n, 3] on the gel: the force sensor's, else those that a tactile sensor tells."""
         if self._force is not None:
-            return self._measured(self._force.drain(), journal)
+            measured = self._measured(self._force.drain(), journal)
+            self._watch(measured[0], looked)
+            return measured
         told = [i for i, samples in enumerate(looked) if samples and "force_n" in samples[0].arrays]
         if self._leads is None and told:
             self._leads = self._streams[told[0]]
@@ -272,6 +276,13 @@ class _Session:
             journal.append("force", {}, time_ns=times, force_n=force, moment_nmm=moment, out_of_range=beyond)
             self._alarm = "the force sensor is out of its range: release" if beyond[-1] else ""
         return times, force
+
+    def _watch(self, times: np.ndarray, looked: Seq[list[Sample]]) -> None:
+        """Raise the alarm if the pictures go on and the force does not: the prompt is that of its last reading."""
+        self._force_ns = int(times[-1]) if len(times) else self._force_ns
+        seen_ns = max((samples[-1].host_time_ns for samples in looked if samples), default=0)
+        if self._force_ns is not None and seen_ns - self._force_ns > _SILENT_S * NS_PER_S:
+            self._alarm = "the force sensor is silent: release, and look at its connection"
 
     def _start(self, key: ContactKey, stage: ContactStage) -> dict[str, Any]:
         return {

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sensors_io.clock import NS_PER_S
 from sensors_io.sync import ClockMap, IndexGaps, PeriodGaps
 
 MS = 1_000_000
@@ -37,6 +38,30 @@ def test_a_restarted_device_clock_starts_anew():
     clock.to_host_ns(10_000 * MS, 0)
     assert clock.to_host_ns(5 * MS, 20 * MS) == 20 * MS
     assert clock.restarts == 1
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.5, 0.9])
+def test_a_clock_that_stands_still_or_runs_slow_is_left_for_the_arrival(rate):
+    """At .9 the least of ten seconds is left behind by a quarter of a second within 2.5 s."""
+    clock = ClockMap()
+    arrival = np.arange(0, 20 * NS_PER_S, 33 * MS)
+    mapped = [clock.to_host_ns(int(rate * h), int(h)) for h in arrival]
+    assert clock.slow
+    assert np.array_equal(mapped[len(mapped) // 4 :], arrival[len(mapped) // 4 :])
+    assert clock.to_host_ns(-1, 21 * NS_PER_S) == 21 * NS_PER_S
+    assert not clock.slow  # the clock has restarted
+
+
+@pytest.mark.parametrize("stall_s", [0.3, 1.0, 4.0])
+def test_samples_that_a_stall_held_up_are_no_slow_clock(stall_s):
+    clock = ClockMap()
+    device = np.arange(0, 20 * NS_PER_S, 33 * MS)
+    for begin in range(20):
+        held = (device >= (5 + begin / 20) * NS_PER_S) & (device < (5 + begin / 20 + stall_s) * NS_PER_S)
+        arrival = np.where(held, device[held].max(), device)
+        mapped = [clock.to_host_ns(int(d), int(h)) for d, h in zip(device, arrival, strict=True)]
+        assert not clock.slow
+        assert np.abs(mapped - device).max() == 0
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.booleans()), min_size=1, max_size=60), st.sampled_from([None, 256]))

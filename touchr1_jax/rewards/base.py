@@ -110,7 +110,8 @@ def total_reward(
       Exception: any other of a reward, with a note of its name.
     """
     check_weights(rewards, weights)
-    values = {name: reward_value(name, rewards[name], parsed, target, tokens, decode) for name in weights}
+    found = {name: reward_value(name, rewards[name], parsed, target, tokens, decode) for name in weights}
+    values = {name: jnp.asarray(value, jnp.float32) for name, value in found.items()}  # 16 bits would round the weight
     applies = {name: _checked(name, "applies", jnp.bool_, (), rewards[name].applies, target) for name in weights}
     share = {name: jnp.where(applies[name], weight, 0.0) for name, weight in weights.items()}
     in_force = sum(share.values())

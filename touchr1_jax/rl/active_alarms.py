@@ -4,6 +4,7 @@ The rules and bounds work as those of `alarms`, on the metrics of `active.explor
 """
 
 from touchr1_jax.rl.alarms import RULES, AlarmRule, Metrics, of_candidates
+from touchr1_jax.rl.alarms import untouched_share as untouched_prompts
 
 SHARED = ("F3", "F7", "F8", "F9", "F10", "F15", "F16")
 """Codes of the rules of `alarms` that hold for trajectories too."""
@@ -41,7 +42,7 @@ def silent_actions(now: Metrics, start: Metrics) -> float | None:
 
 
 ACTIVE_RULES: tuple[AlarmRule, ...] = (
-    *(rule for rule in RULES if rule.code in SHARED),
+    *(rule for rule in RULES if rule.code in SHARED and rule.check is not untouched_prompts),  # A1 counts these
     AlarmRule(
         code="A1",
         meaning="the policy never touches: lower the prices, or start from a policy that touches at random",

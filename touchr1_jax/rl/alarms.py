@@ -28,7 +28,7 @@ NO_LEAD = 0.04
 answers and from 640 under a control."""
 
 LEFT_OUT = "left_out_share"
-"""Share of the last `WINDOW` updates that were left out, for their gradient was not finite."""
+"""Share of the last `WINDOW` steps of which an update was left out, for it was not finite."""
 
 Metrics = Mapping[str, float]
 
@@ -130,9 +130,8 @@ def _leads(now: Metrics) -> dict[str, float]:
 def idle_groups(now: Metrics, start: Metrics) -> float | None:
     """F7: share of groups of equal rewards among those that are not solved yet, while answers do not improve.
 
-    A group that is all right has nothing to learn, and alarm F15 counts those that are left out.  Under dynamic
-    sampling these are shares of all candidates (`drawn_…` in the log), because the selected groups hide those that
-    were not selected.
+    A group that is all right has nothing to learn, and alarm F15 counts those that are left out.  Shares are of all
+    candidates (`drawn_…` in the log), because selected groups hide the others.
     """
     if "idle_share" not in now:  # no line of older logs has it
         return None
@@ -173,6 +172,12 @@ def touched_share(now: Metrics, start: Metrics) -> float | None:
     return now.get("touch_share")
 
 
+def untouched_share(now: Metrics, start: Metrics) -> float | None:
+    """F10: share of the prompts without touch, where others have some."""
+    del start
+    return 1 - now["touch_share"] if now.get("touch_share", 0.0) > 0 else None
+
+
 def left_out_groups(now: Metrics, start: Metrics) -> float | None:
     """F15: share of the groups that are left out because a reward is not finite.
 
@@ -183,7 +188,7 @@ def left_out_groups(now: Metrics, start: Metrics) -> float | None:
 
 
 def left_out_updates(now: Metrics, start: Metrics) -> float | None:
-    """F15: share of the last `WINDOW` updates that were left out because a gradient was not finite."""
+    """F15: share of the last `WINDOW` steps with an update that was left out, because it was not finite."""
     del start
     return now[LEFT_OUT]
 
@@ -302,6 +307,14 @@ RULES: tuple[AlarmRule, ...] = (
         at_once=True,
     ),
     AlarmRule(
+        code="F10",
+        meaning="prompts of a batch have no touch, others have",
+        bound=0.0,
+        reason="their answers are guesses, rewarded like the others",
+        check=untouched_share,
+        at_once=True,
+    ),
+    AlarmRule(
         code="F12",
         meaning="all frames have the same time index, so that shuffled frames test nothing",
         bound=0.01,
@@ -324,7 +337,7 @@ RULES: tuple[AlarmRule, ...] = (
     ),
     AlarmRule(
         code="F15",
-        meaning="updates are skipped, because their gradient is not finite",
+        meaning="updates are skipped, because their gradient or the policy after them is not finite",
         bound=0.1,
         reason="one update in ten is lost; a single one may be a rare overflow",
         check=left_out_updates,
@@ -362,10 +375,9 @@ class AlarmMonitor:
     def update(self, metrics: Metrics, *, left_out: bool = False) -> list[Alarm]:
         """The alarms after one more step; before the first window is full, only those that judge single steps.
 
-        Args:
-          metrics: of the step; empty where the update was `left_out`, whose metrics may not be finite.
-          left_out: the update was left out because its gradient was not finite.
+        Metrics of a step of which an update was `left_out`, or counted in `lost_updates`, may not be finite or empty.
         """
+        left_out = left_out or metrics.get("lost_updates", 0.0) > 0
         self._left_out.append(left_out)
         at_once = {**metrics, LEFT_OUT: sum(self._left_out) / WINDOW}
         found = [rule.alarm(at_once, at_once) for rule in self._rules if rule.at_once]

@@ -14,8 +14,11 @@ from touchr1_jax.rl.config import GRPOConfig, ratio_to_learner
 from touchr1_jax.rl.gradient import COUNTED, GROUNDING, PERTURBED, Experience, batches_of, grpo_gradient, log_probs
 from touchr1_jax.rl.losses import divisor
 from touchr1_jax.rl.trust_region import within_trust
-from touchr1_jax.skipping import Skipping
+from touchr1_jax.skipping import Skipping, count_lost
 from touchr1_jax.types import Params
+
+LOST = "lost_updates"
+"""Metric: optimizer steps that were left out, because the gradient or the policy after them was not finite."""
 
 Gradient = tuple[Params, dict[str, Array], Float[Array, "P G T"]]
 """Gradient, parts and old log-probabilities, as `grpo_gradient` returns them."""
@@ -36,7 +39,7 @@ def update_policy(
     the same parameters, the mean of the minibatches' gradients is the gradient of the whole batch.
 
     Returns:
-      Parameters, state of the optimizer, and parts of the first pass, with `clip_share` of the last.
+      Parameters, state of the optimizer, and parts of the first pass, with `clip_share` of the last and `LOST` of all.
     """
     algorithm, longest = config.algorithm, divisor(config, learn.rollout.mask)
     number, count = algorithm.minibatches, algorithm.updates
@@ -58,13 +61,15 @@ def update_policy(
         part = part._replace(old=old) if number == 1 else part
         grads, parts, old = bucketed_gradient(fns, config, params, reference, part, first, longest)
         norm = optax.tree.norm(grads)
-        moved, opt_state = finite_update(optimizer, grads, norm, opt_state, params)
-        parts = parts | {"grad_norm": norm}
+        moved, after = finite_update(optimizer, grads, norm, opt_state, params)
+        lost = ~jnp.isfinite(norm)
         if (trust := algorithm.trust_nat) is not None:
             part = part._replace(old=old if origin is None else origin)
             moved, size = within_trust(fns, config, params, moved, part, trust)
-            parts |= size
-        return (moved, opt_state, old if number == 1 else learn.old), parts
+            parts, too_far = parts | size, size["update_scale"] == 0
+            lost, after = lost | too_far, count_lost(opt_state, after, too_far)
+        parts = parts | {"grad_norm": norm, LOST: lost.astype(jnp.float32)}
+        return (moved, after, old if number == 1 else learn.old), parts
 
     start = (params, opt_state, learn.old)
     if number == count == 1:
@@ -75,7 +80,7 @@ def update_policy(
     (params, opt_state, _), all_parts = jax.lax.scan(once, start, places)
     of_pass = lambda steps: over_minibatches({name: x[steps] for name, x in all_parts.items()})
     parts, last = of_pass(slice(number)), of_pass(slice(-number, None))
-    return params, opt_state, parts | {"clip_share": last["clip_share"]}
+    return params, opt_state, parts | {"clip_share": last["clip_share"], LOST: jnp.sum(all_parts[LOST])}
 
 
 def over_minibatches(parts: dict[str, Float[Array, "n"]]) -> dict[str, Float[Array, ""]]:

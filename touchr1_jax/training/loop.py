@@ -51,7 +51,7 @@ class NonFiniteGradientError(RuntimeError):
 class LoopConfig:
     """Number of steps, steps between checkpoints, and how many updates in a row may be left out.
 
-    An update is left out if its gradient is not finite (see `skipping.skip_nonfinite`).
+    An update is left out if its gradient, or the policy after it, is not finite (see `skipping`).
     """
 
     steps: int
@@ -294,9 +294,9 @@ class _LateLines:
         self._log(t, values)
         if in_a_row > self._most:
             raise NonFiniteGradientError(
-                f"step {t}: the gradient was not finite in {in_a_row} updates in a row, {skipped} in all; at most "
-                f"{self._most} in a row may be left out: lower the learning rate, or look at what the batches from "
-                f"step {t + 1 - in_a_row} on hold; nothing was saved since the last checkpoint"
+                f"step {t}: the gradient or the policy after it was not finite in {in_a_row} updates in a row, "
+                f"{skipped} in all; at most {self._most} in a row may be left out: lower the learning rate, or look at "
+                f"what the batches from step {t + 1 - in_a_row} on hold; nothing was saved since the last checkpoint"
             )
 
 

@@ -1,24 +1,23 @@
 """Digests of a run depend on the numbers of its checkpoints and of its data iterator, not on the devices used."""
 
+import shutil
+
 import jax.numpy as jnp
-import orbax.checkpoint as ocp
 import pytest
 
 from experiments.core.artifacts import write_json
 from experiments.faults.digests import differences, digests
+from touchr1_jax.training.checkpoint import Checkpoints
 
 
 @pytest.fixture
 def run(tmp_path):
     """A finished run with one checkpoint of these numbers."""
 
-    def make(name: str, weight: float = 1.0, drawn: bytes = b"3"):
+    def make(name: str, weight: float = 1.0, drawn: int = 3):
         directory = tmp_path / name
-        step = directory / "checkpoints" / "sft" / "0" / "12"
-        with ocp.StandardCheckpointer() as checkpointer:
-            checkpointer.save(step / "state", {"w": jnp.array([weight, 2.0]), "step": jnp.array(12)})
-        (step / "data").mkdir()
-        (step / "data" / "metadata").write_bytes(drawn)
+        with Checkpoints(directory / "checkpoints" / "sft" / "0") as checkpoints:
+            checkpoints.save(12, {"w": jnp.array([weight, 2.0]), "step": jnp.array(12)}, drawn)
         (directory / "metrics.jsonl").write_text("")
         write_json(directory / "results.json", {"verdict": [], "data": {}})
         return directory
@@ -29,7 +28,7 @@ def run(tmp_path):
 def test_numbers_and_the_data_iterator_count(run):
     a = digests(run("a"))
     assert a == digests(run("b"))
-    for name, change in (("c", {"weight": 1.0 + 1e-7}), ("d", {"drawn": b"4"})):
+    for name, change in (("c", {"weight": 1.0 + 1e-7}), ("d", {"drawn": 4})):
         assert differences(a, digests(run(name, **change))) == ("state of sft/0",)
 
 
@@ -43,7 +42,11 @@ def test_the_file_that_names_the_devices_does_not_count(run):
 def test_a_half_deleted_old_checkpoint_does_not_count_and_a_missing_one_does(run):
     whole, killed = run("a"), run("b")
     stage = killed / "checkpoints" / "sft" / "0"
-    (stage / "8" / "state").mkdir(parents=True)
-    assert digests(whole) == digests(killed)
+    files = [path.relative_to(stage / "12") for path in (stage / "12").rglob("*") if path.is_file()]
+    for lost in files:
+        half = shutil.copytree(stage / "12", stage / "8")
+        (half / lost).unlink()
+        assert digests(whole) == digests(killed), lost
+        shutil.rmtree(half)
     (stage / "12" / "data" / "metadata").unlink()
     assert differences(digests(whole), digests(killed)) == ("state of sft/0",)

@@ -1,5 +1,7 @@
 """Messages that break a protocol end no stream and are counted once."""
 
+import contextlib
+import socket
 import struct
 import time
 
@@ -8,11 +10,12 @@ import pytest
 
 from sensors_io.clock import JumpingClock
 from sensors_io.devices import tac3d_messages
-from sensors_io.devices.errors import WrongRateWarning
+from sensors_io.devices.errors import DeviceDataError, TwoSendersWarning, WrongRateWarning
 from sensors_io.devices.intake import Intake
 from sensors_io.devices.reader import Reader
 from sensors_io.devices.replay import Replay
 from sensors_io.devices.sources import Tac3dRecording
+from tests.sensors_io.checks import refused
 from tests.sensors_io.devices.fakes import sample, sent
 from tests.sensors_io.devices.test_netft import record, sensor
 from tests.sensors_io.devices.test_tac3d import datagrams, layout, listening, pushed
@@ -69,6 +72,39 @@ def test_two_programs_on_one_port_do_not_mix():
     assert serials == ["A", "B"]
 
 
+def test_two_programs_behind_one_address_are_named():
+    assembler = tac3d_messages.Assembler()
+    ours, theirs = (datagrams(pushed([0, 0, -n], [0, 0, -n]), number=7, index=7) for n in (1, 2))
+    assert assembler.add(ours[0]) is assembler.add(ours[1]) is assembler.add(ours[1]) is None
+    refused(DeviceDataError, "packet 1 of message 7 came twice with other bytes", assembler.add, theirs[1])
+    assert [assembler.add(part) for part in ours[2:]] == [None, None]
+
+
+def test_a_second_program_of_one_serial_is_passed_over_until_the_first_is_silent(vendor):
+    sender, port = vendor
+    twin = lambda number: datagrams(pushed([0, 0, -2], [0, 0, -0.1]), number=number, index=number)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.connect(("127.0.0.1", port))
+        with contextlib.ExitStack() as first:
+            first.enter_context(sent(sender, message()))
+            with listening(port) as device, sent(other, twin):
+                pressed = lambda: float(device.read(5.0).arrays["force_n"][2])
+                with pytest.warns(TwoSendersWarning, match="send as this serial"):
+                    assert {pressed() for _ in range(20)} == {-1}
+                first.close()
+                assert any(pressed() == -2 for _ in range(200))
+
+
+@pytest.mark.parametrize("lost", [(), (3, 20)])
+def test_a_counter_that_restarts_without_a_silence_costs_a_quarter_of_a_second(lost):
+    intake = Intake(capacity=99, clock=JumpingClock())
+    numbers = [n for n in range(50) if n not in lost] + [*range(50)]
+    for k, number in enumerate(numbers):
+        intake.offer(sample(number, time_ms=30 * k))
+    late = len(lost)  # two of the numbers seem late
+    assert (intake.counts.restarts, intake.counts.duplicates, intake.counts.late) == (1, 8 - min(late, 1), min(late, 1))
+
+
 def test_a_layout_of_spaces_is_read_in_linear_time():
     spaces = layout({"3D_ResultantForce": np.ones((1, 3))}).replace(b'msg: ""', b"msg:" + b" " * 64_500 + b"x")
     began = time.process_time()
@@ -82,14 +118,15 @@ def test_a_repeated_replay_keeps_the_gaps_of_the_recording(tmp_path):
         assert [device.read(1.0).index for _ in range(6)] == [3, 4, 7, 8, 9, 12]
 
 
-def test_a_record_that_another_overtook_is_no_wrong_rate():
+@pytest.mark.parametrize("waited", [0, 50])
+def test_a_record_that_another_overtook_or_that_waited_is_no_wrong_rate(waited):
     class OnTime(list):
-        """The record of each moment, 1,000 a second, the first two in the wrong order."""
+        """The record of each moment, 1,000 a second, the first two in the wrong order and late by some ms."""
 
         def __iter__(self):
             began = time.monotonic()
             for k in super().__iter__():
-                yield record(6 - k if k < 2 else 6 + round(1000 * (time.monotonic() - began)), *[0] * 6)
+                yield record(6 - k if k < 2 else 6 + waited + round(1000 * (time.monotonic() - began)), *[0] * 6)
                 time.sleep(0.005)
 
     with sensor(OnTime(range(80))) as (config, _), config.open() as device:
@@ -108,10 +145,10 @@ def test_a_wrong_rate_of_a_force_sensor_warns_and_leaves_its_stamps_out():
                 yield datagram
 
     with (
-        sensor(Slow(record(k, *[0] * 6) for k in range(60))) as (config, _),
+        sensor(Slow(record(k, *[0] * 6) for k in range(80))) as (config, _),
         config.open() as device,
         pytest.warns(WrongRateWarning, match="rate_hz is 1000"),
     ):
-        stamps = [device.read(5.0).device_time_ns for _ in range(60)]
+        stamps = [device.read(5.0).device_time_ns for _ in range(80)]
     assert stamps[0] == 0
     assert stamps[-5:] == [None] * 5

@@ -104,7 +104,7 @@ def test_rerun_on_a_full_disk_is_named(tmp_path, monkeypatch, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["r"]
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EMFILE])
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EMFILE, errno.ELOOP])
 def test_errors_of_the_system_get_a_fix(tmp_path, monkeypatch, capsys, number):
     def fails(*args, **options):
         raise OSError(number, "the system's words")

@@ -74,5 +74,6 @@ def test_legendre_products_are_orthogonal() -> None:
 def test_what_does_not_fit_is_refused() -> None:
     weights = np.zeros((3, 3, 2), np.float32)
     refused(ValueError, r"must be float32\[3, 9, 2\]", ColourMap, weights=weights, degree=2, position_degree=1)
+    refused(ValueError, "must be float32", ColourMap, weights=weights, degree=10**6, position_degree=1)  # at once
     reader = SlopeReader(random_map(1, 0), np.zeros((12, 16, 3), np.uint8))
     refused(ValueError, "must be equal", reader, np.zeros((12, 17, 3), np.uint8))

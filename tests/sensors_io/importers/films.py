@@ -31,9 +31,9 @@ def film(path, frames=12, size=(24, 32), rate=25.0):
     return path
 
 
-def uneven_film(path, times_ms, sound_s=0.0):
+def uneven_film(path, times_ms, sound_s=0.0, **options):
     """A video of 32 × 24 px whose frames have these times, with sound of so many seconds."""
-    with av.open(str(path), "w") as out:
+    with av.open(str(path), "w", options=options) as out:
         stream = out.add_stream("mpeg4", rate=30)
         stream.width, stream.height, stream.pix_fmt, stream.codec_context.time_base = 32, 24, "yuv420p", MS
         sound = out.add_stream("aac", rate=48_000) if sound_s else None

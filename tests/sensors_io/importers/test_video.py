@@ -81,6 +81,28 @@ def test_sound_may_last_a_little_longer_and_pictures_begin_late(tmp_path, first_
     refused(VideoError, "is cut off, or its sound is longer", read_video, path, Keep(**WHOLE))
 
 
+def test_an_mp4_in_fragments_is_whole_whatever_its_sound_and_refused_where_it_is_cut(tmp_path):
+    path = uneven_film(tmp_path / "a.mp4", range(0, 2000, 40), 4.0, movflags="frag_keyframe+empty_moov")
+    assert read_video(path, Keep(**WHOLE)).total == 50
+    data = path.read_bytes()
+    for end in (data.rindex(b"mfra") - 4, data.rindex(b"mdat") - 4, *range(len(data) - 1, 1000, -499)):
+        path.write_bytes(data[:end])
+        refused(VideoError, "is cut off|no frame|not open", read_video, path, Keep(**WHOLE))
+
+
+@pytest.mark.parametrize("cut_off", [0, 1])
+def test_pictures_that_an_edit_list_trims_are_not_lost(tmp_path, cut_off):
+    path = uneven_film(tmp_path / "a.mp4", range(0, 2000, 40), movflags="faststart")
+    data = bytearray(path.read_bytes())
+    begin, scale = data.index(b"elst") + 16, data.index(b"mdhd") + 16
+    data[begin : begin + 4] = (int.from_bytes(data[scale : scale + 4]) * 2 // 5).to_bytes(4)
+    path.write_bytes(data[: len(data) - cut_off])
+    if cut_off:
+        refused(VideoError, "is cut off: 40 of 50", read_video, path, Keep(**WHOLE))
+    else:
+        assert read_video(path, Keep(**WHOLE)).total == 40
+
+
 def test_a_matroska_file_of_unknown_size_is_as_whole_as_its_frames(tmp_path):
     """A recorder that is killed, or that writes into a pipe, leaves it."""
     path = uneven_film(tmp_path / "a.mkv", range(0, 2000, 40))

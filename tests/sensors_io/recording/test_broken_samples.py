@@ -101,10 +101,53 @@ def test_readings_of_a_force_sensor_that_are_not_finite_are_flagged_and_counted(
     assert not recwarn.list
 
 
+def test_a_force_sensor_that_falls_silent_raises_an_alarm(tmp_path):
+    class Silent(Scale):
+        def drain(self):
+            return [s for s in super().drain() if not 200 * MS <= s.host_time_ns - 10**9 < 1500 * MS]
+
+    hand = Hand()
+    assert record_session(tmp_path, SHORT, [Camera(hand)], Silent(hand), show=hand.show).contacts == 2
+    alarms = [status.alarm for status in hand.statuses]
+    assert sum(alarm.startswith("the force sensor is silent: release") for alarm in alarms) in range(20, 40)
+    assert alarms[-1] == ""
+
+
 def test_samples_of_another_shape_are_left_out_and_counted(tmp_path):
     made = recorded(tmp_path, with_arrays(depth_mm=np.zeros((4, 4), np.float32)))
     assert made.camera["recording"]["left_out"] == 3
     assert np.flatnonzero(made.flags & np.uint32(Flag.TIME_GAP)).tolist() == [19]
+
+
+class Partly(Camera):
+    """A camera that gives its frames for some numbers alone."""
+
+    def __init__(self, hand, there):
+        super().__init__(hand, "digit")
+        self.there = there
+
+    def drain(self):
+        samples = super().drain()
+        return samples if self.there(self.count) else []
+
+
+@pytest.mark.parametrize(
+    ("there", "silent", "marked"),
+    [
+        (lambda n: n < 100, [False, True], [-1]),
+        (lambda n: n > 100, [True, False], [0]),
+        (lambda n: 40 < n < 160, [False, False], []),
+    ],
+)
+def test_a_sensor_that_is_silent_at_either_end_of_a_contact_is_flagged_and_counted(tmp_path, there, silent, marked):
+    hand = Hand()
+    config = dataclasses.replace(CONFIG, free_s=4.0)
+    report = record_session(tmp_path, config, [Camera(hand), Partly(hand, there)], None, show=hand.show)
+    assert +report.silent == ({"digit": 1} if any(silent) else {})
+    made = RecordStore(tmp_path).contact(0)["digit"]
+    assert [s > 1 for s in made.camera["recording"]["silent_s"]] == silent
+    gaps = np.flatnonzero(made.flags & np.uint32(Flag.TIME_GAP))
+    assert gaps.tolist() == [range(len(made))[n] for n in marked]
 
 
 def test_a_contact_that_cannot_be_stored_keeps_its_journal_and_later_sessions_go_on(tmp_path, monkeypatch):

@@ -2,6 +2,7 @@
 
 import errno
 import mmap
+import os
 import tracemalloc
 
 import numpy as np
@@ -66,6 +67,12 @@ def test_damage_inside_is_refused(journal, entry, byte):
     data[start + byte] ^= 64
     journal.write_bytes(data)
     refused(JournalError, f"damaged at byte {start}:", read_journal, journal)
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
+def test_a_pipe_or_a_folder_in_the_place_of_a_journal_is_refused(tmp_path, make):
+    make(tmp_path / "a.journal")  # who opened the pipe would wait for ever
+    refused(JournalError, "a.journal is no journal .*move it away", read_journal, tmp_path / "a.journal")
 
 
 def test_a_journal_is_never_overwritten(journal):

@@ -44,6 +44,13 @@ def test_the_sum_of_the_weights_is_kept():
         assert total({name: 3 * w for name, w in WEIGHTS.items()}, constant(0), target)[0] == pytest.approx(3)
 
 
+@pytest.mark.parametrize("kind", [jnp.float16, jnp.bfloat16, jnp.float32])
+def test_a_weight_is_not_rounded_to_the_type_of_a_reward(kind):
+    rewards = {"mine": Reward(lambda p, t: jnp.ones((), kind))}
+    for weight in (0.3, 1e-9, 1e6):
+        assert total({"mine": weight}, constant(0), make_target(), rewards)[1]["mine"] == np.float32(weight)
+
+
 @pytest.mark.parametrize("name", ALONE)
 def test_every_reward_is_a_scalar(name):
     parsed, target = constant(0), make_target()

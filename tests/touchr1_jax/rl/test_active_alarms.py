@@ -55,6 +55,7 @@ def test_fires_with_its_number(code):
 NO_FAILURE = {
     "a healthy run": {},
     "one touch, and answers are better": {"one_action_share": 1.0, "drawn_accuracy": 0.7},
+    "some trajectories without a touch": {"touch_share": 0.9},
     "one touch of one": {"one_action_share": 1.0, "budget": 1.0},
     "every touch, and time is free": {"all_actions_share": 1.0, "reward_seconds": 0.0},
     "one question": {"first_kind_information": 0.0, "questions": 1.0},

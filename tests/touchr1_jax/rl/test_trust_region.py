@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from tests.touchr1_jax import tiny
@@ -13,6 +14,8 @@ from touchr1_jax.rl.config import GRPOConfig, Paper
 from touchr1_jax.rl.gradient import Experience, log_probs
 from touchr1_jax.rl.rollout import SampleConfig, sample_group
 from touchr1_jax.rl.trust_region import within_trust
+from touchr1_jax.rl.update import update_policy
+from touchr1_jax.skipping import count_skipped, skip_nonfinite
 
 G, T, DELTA = 8, 4, 0.01
 CONFIG = GRPOConfig(prompts=P, group=G, length=T, micro_prompts=P, algorithm=Paper())
@@ -87,6 +90,24 @@ def test_an_update_to_parameters_that_are_not_finite_is_left_out(learn):
     params, size = jax.jit(lambda after: within_trust(FNS, CONFIG, BEFORE, after, learn, DELTA))(after)
     assert size["update_scale"] == 0
     jax.tree.map(np.testing.assert_array_equal, params, BEFORE)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("guard", "counts"), [(skip_nonfinite, [1, 1]), (lambda optimizer: optimizer, None)], ids=["ours", "a caller's own"]
+)
+def test_an_update_that_is_left_out_is_counted(learn, guard, counts):
+    """Both gradients are finite, and the second of two updates is far too long."""
+    algorithm = Paper(beta=0.0, gamma=0.0, trust_nat=DELTA, updates=2)
+    config = dataclasses.replace(CONFIG, algorithm=algorithm)
+    optimizer = guard(optax.sgd(lambda count: jnp.where(count == 0, 0.0, 1e30)))
+    learn = learn._replace(advantage=jnp.ones((P, G)))
+    update = jax.jit(lambda: update_policy(FNS, optimizer, config, BEFORE, optimizer.init(BEFORE), BEFORE, learn))
+    params, state, parts = update()
+    jax.tree.map(np.testing.assert_array_equal, params, BEFORE)
+    assert parts["lost_updates"] == 1
+    found = count_skipped(state)
+    assert found is counts or found.tolist() == counts
 
 
 @pytest.mark.long
