@@ -87,7 +87,22 @@ class GatedMLP(nn.Module):
     def __call__(self, x: Float[Array, "*n D"]) -> Float[Array, "*n D"]:
         gate = Dense(self.hidden, use_bias=self.use_bias, name="gate")(x)
         up = Dense(self.hidden, use_bias=self.use_bias, name="up")(x)
-        return Dense(x.shape[-1], use_bias=self.use_bias, name="down")(nn.silu(gate) * up)
+        return Dense(x.shape[-1], use_bias=self.use_bias, name="down")(gated(gate, up))
+
+
+@jax.custom_vjp
+def gated(gate: Float[Array, "*n D"], up: Float[Array, "*n D"]) -> Float[Array, "*n D"]:
+    """silu(gate) ⊙ up; the gradient computes σ(gate) again, which XLA on CPU would store and read three times."""
+    return nn.silu(gate) * up
+
+
+def _gated_backward(saved: tuple[Array, Array], g: Array) -> tuple[Array, Array]:
+    gate, up = saved
+    share = nn.sigmoid(gate)
+    return g * up * share * (1 + gate * (1 - share)), g * gate * share
+
+
+gated.defvjp(lambda gate, up: (gated(gate, up), (gate, up)), _gated_backward)
 
 
 class Rotation(NamedTuple):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from touchr1_jax.models.layers import MASKED, GatedMLP, KeySource, RMSNorm, attend, mrope, rotate
+from touchr1_jax.models.layers import MASKED, GatedMLP, KeySource, RMSNorm, attend, gated, mrope, rotate
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
@@ -39,6 +39,14 @@ def test_gated_mlp_by_hand():
     y = GatedMLP(2).apply({"params": params}, jnp.array([[2.0]]))
     silu = lambda v: v / (1 + np.exp(-v))
     np.testing.assert_allclose(y, [[silu(2) * 4 + 10 * silu(-2) * 6]], rtol=1e-6)
+
+
+def test_the_gradient_of_the_gate_is_that_of_its_equation():
+    gate, up, weight = normal(50) * 4, normal(50), normal(50)
+    plain = lambda gate, up: jnp.sum(weight * jax.nn.silu(gate) * up)
+    found = jax.grad(lambda gate, up: jnp.sum(weight * gated(gate, up)), argnums=(0, 1))(gate, up)
+    for mine, whole in zip(found, jax.grad(plain, argnums=(0, 1))(gate, up), strict=True):
+        np.testing.assert_allclose(mine, whole, rtol=1e-5, atol=1e-6)
 
 
 def test_mrope_angles_by_hand():
