@@ -9,8 +9,8 @@ small that the loop takes most of the time of a step.  Damage: every file of an 
 bits in all files of a study and its cache.  Bad input: about forty kinds through the public command lines.  Waiting:
 the share of a step that waits for data, on a CPU.
 
-Cost: 111 minutes in the recorded run on one core of a busy machine, most of it the 200 kills, without the pairs of
-studies, which take one to three minutes each; `--scale smoke` eight minutes of one core where nothing is compiled yet.
+Cost: 91 minutes in the recorded run on one core of a busy machine, most of it the 200 kills, with three pairs of
+studies, two to four minutes each; `--scale smoke` eight minutes of one core where nothing is compiled yet.
 
 Expected: no difference in any bit; no wrong result; for every bad input an error that names the place and the fix;
 waits below 2 % of a step.

@@ -305,9 +305,9 @@ class Intake:
     def _on_host_clock(self, sample: Sample) -> Sample:
         if sample.device_time_ns is None:
             return sample
-        told = self._clock_map.slow
+        before = self._clock_map.slow
         mapped = self._clock_map.to_host_ns(sample.device_time_ns, sample.host_time_ns)
-        if self._clock_map.slow and not told:
+        if self._clock_map.slow and not before:
             warnings.warn(
                 "the stamps of a device stand still, or run slower than this machine's clock: its samples are timed by "
                 "their arrival; look at the clock of its program",
