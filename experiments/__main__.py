@@ -7,7 +7,7 @@ import sys
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # see `experiments.core.numerics`; read when NumPy is imported
 
-from sensors_io.errors import require_words
+from sensors_io.errors import require_kept, require_words
 from sensors_io.signals import end_as_interrupted, leave_interrupted, say
 
 SIGNALLED = 128
@@ -43,6 +43,7 @@ def main() -> None:
         print_in_any_encoding()
         try:
             require_words(arguments)
+            require_kept(arguments)
         except ValueError as error:
             say(f"ValueError: {error}")
             leave(2)

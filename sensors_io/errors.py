@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import struct
 from collections.abc import Sequence
 
@@ -35,6 +36,17 @@ def require_words(args: Sequence[str]) -> None:
         if not word or (word.startswith("--") and word.endswith("=")):
             option = word.removesuffix("=") or (before if before.startswith("--") else "an argument")
             raise ValueError(f"{option} is '': must not be empty; give its value, or leave it out")
+
+
+def require_kept(args: Sequence[str]) -> None:
+    """Refuse a URL in the memory of this process: what is written there is lost when the process ends.
+
+    Raises:
+      ValueError: naming it.
+    """
+    for word in args:
+        if re.match(r"(--[\w.-]+=)?memory:/", word):
+            raise ValueError(f"{word}: is kept in the memory of this process alone; name a folder, or another URL")
 
 
 def path_text(path: str | os.PathLike[str]) -> str:

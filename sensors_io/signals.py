@@ -1,8 +1,12 @@
 """The signals that end a program: what it has begun is closed or removed, as after Ctrl-C."""
 
+import os
 import signal
 import sys
-from types import FrameType
+from types import FrameType, TracebackType
+from typing import TypeVar
+
+E = TypeVar("E", bound=BaseException)
 
 ENDING = (signal.SIGTERM, signal.SIGHUP)
 """The signal of a scheduler, and that of a terminal or a connection that was closed."""
@@ -22,6 +26,8 @@ def end_as_interrupted() -> None:
     """Raise `Ended` at the first of `ENDING`; a signal that is ignored, as under nohup, stays so.
 
     What is raised within a callback of the garbage collector, such as JAX's, Python only reports: it comes again.
+    What is raised while an extension loads becomes an `ImportError`: where that is caught nowhere, the program ends as
+    by the signal.
     """
     for number in ENDING:
         if signal.getsignal(number) is signal.SIG_DFL:
@@ -30,6 +36,23 @@ def end_as_interrupted() -> None:
     sys.unraisablehook = lambda lost: (
         _again(lost.exc_value) if isinstance(lost.exc_value, KeyboardInterrupt) else report(lost)
     )
+    show = sys.excepthook
+
+    def leave(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        if (cause := hidden_in(error, KeyboardInterrupt)) is None:
+            show(kind, error, trace)
+        else:
+            os._exit(leave_interrupted(cause, "interrupted: run the same command again"))
+
+    sys.excepthook = leave
+
+
+def hidden_in(error: BaseException, kind: type[E]) -> E | None:
+    """The exception of one kind that this is, or that an import turned into this `ImportError`."""
+    cause: BaseException | None = error
+    while isinstance(cause, ImportError):
+        cause = cause.__cause__ or cause.__context__
+    return cause if isinstance(cause, kind) else None
 
 
 def leave_interrupted(error: KeyboardInterrupt, message: str) -> int:

@@ -5,6 +5,9 @@ import importlib
 import itertools
 import re
 import shlex
+import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -114,3 +117,34 @@ def test_commands_of_an_experiment_are_understood(name):
     assert any(arguments.split()[0] == name for _, arguments in commands), "its docstring shows no command"
     for module, arguments in commands:
         assert status(module, arguments) == 0, f"python -m {module} {arguments}"
+
+
+INTERRUPTED = """
+import runpy, signal, sys
+_, module, imported = sys.argv
+sys.argv[1:] = ["list"]
+class Strike:
+    def find_spec(self, name, path=None, target=None):
+        if name == imported:
+            signal.raise_signal(signal.SIGINT)
+sys.meta_path.insert(0, Strike())
+signal.signal(signal.SIGINT, signal.default_int_handler)
+runpy.run_module(module, run_name="__main__", alter_sys=True)
+"""
+
+
+@pytest.mark.parametrize(
+    ("module", "imported"),
+    [
+        ("experiments", "experiments.core.commands"),
+        ("experiments.bench", "experiments.bench.contacts"),
+        ("sensors_io", "sensors_io.commands.console"),
+        ("touchr1_jax.rewards", "touchr1_jax.rewards.proof"),
+    ],
+)
+def test_ctrl_c_while_a_command_is_imported_is_no_traceback(module, imported):
+    ended = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED, module, imported], capture_output=True, text=True, check=False
+    )
+    assert ended.returncode in (128 + signal.SIGINT, -signal.SIGINT)
+    assert "Traceback" not in ended.stderr

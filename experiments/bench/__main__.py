@@ -1,5 +1,10 @@
 """`python -m experiments.bench`: make, annotate, audit and score the questions of the touch bench."""
 
+from sensors_io.signals import end_as_interrupted, leave_interrupted
+
+if __name__ == "__main__":
+    end_as_interrupted()  # first: the other imports take seconds
+
 import contextlib
 import dataclasses
 import itertools
@@ -19,7 +24,6 @@ from experiments.core.text import number
 from sensors_io.commands.console import complain, print_in_any_encoding, progress_bar
 from sensors_io.errors import UserError
 from sensors_io.records import RecordStore
-from sensors_io.signals import end_as_interrupted, leave_interrupted
 from sensors_io.units import HERE, Launcher, finish
 from touchr1_jax.bench.items import ItemError, read_items, write_items
 from touchr1_jax.bench.json_lines import LinesError, read_lines, write_lines
@@ -277,5 +281,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    end_as_interrupted()
     sys.exit(main())

@@ -9,7 +9,7 @@ import weakref
 from collections.abc import Callable, Iterator
 from types import FrameType
 
-from sensors_io.signals import ENDING
+from sensors_io.signals import ENDING, hidden_in
 
 SIGNALS = (signal.SIGINT, *ENDING)
 """Control-C, the signal that a scheduler sends before it takes the machine away, and that of a closed terminal."""
@@ -52,6 +52,8 @@ class Stopping:
         sys.unraisablehook = lambda lost: None if isinstance(lost.exc_value, Stopped) else report(lost)
         try:
             yield
+        except ImportError as error:  # of an extension that was loading when the signal came
+            raise (hidden_in(error, Stopped) or error) from error.__cause__
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0)
             sys.unraisablehook = report

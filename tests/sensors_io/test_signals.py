@@ -20,6 +20,7 @@ ALL = (signal.SIGINT, *ENDING)
 def handlers(monkeypatch):
     """Handlers of a program that was just started, and afterwards those of the tests."""
     monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
+    monkeypatch.setattr(sys, "excepthook", sys.excepthook)
     before = {number: signal.getsignal(number) for number in (*ALL, signal.SIGALRM)}
     for number in ALL:
         signal.signal(number, signal.SIG_DFL)
@@ -56,6 +57,23 @@ def test_a_signal_within_a_callback_of_the_garbage_collector_is_not_lost(number)
     with pytest.raises(KeyboardInterrupt) as stopped:
         collect()
     assert leave_interrupted(stopped.value, "") == 128 + number
+
+
+@pytest.mark.parametrize("number", ALL)
+def test_a_signal_while_an_extension_loads_is_no_import_error(number):
+    """pybind11 turns what is raised then into an ImportError."""
+    code = f"""
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from sensors_io.signals import end_as_interrupted
+end_as_interrupted()
+try:
+    signal.raise_signal({number})
+except BaseException as error:
+    raise ImportError("initialization failed") from error
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (128 + number, "interrupted: run the same command again\n")
 
 
 def test_a_signal_that_is_ignored_stays_so():

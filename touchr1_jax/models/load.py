@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import math
 import resource
+import signal
 import sys
 import time
 from collections.abc import Iterator
@@ -139,6 +140,8 @@ class Load:
                 f"{type(error).__name__}: {error}", markup=False, highlight=False
             )
             return 1
+        except KeyboardInterrupt:
+            return 128 + signal.SIGINT  # as shells have it
         leaves = jax.tree.leaves(found.params)
         size, peak = sum(x.nbytes for x in leaves), peak_memory()
         d, v = found.config.decoder, found.config.vision

@@ -193,17 +193,17 @@ def read_policy(folder: Path) -> SavedPolicy:
         reads, questions = rebuilt(PolicyInput, shown), dict(config["questions"])
         vocabulary = json.loads((folder / TOKENIZER_FILE).read_text(encoding="utf-8"))["model"]["vocab"]
         words = sorted(vocabulary, key=vocabulary.__getitem__)[len(word_library(()).get_vocab()) :]
+        if word_library(words).get_vocab() != vocabulary:
+            raise ValueError(f"ids of the words in {TOKENIZER_FILE} must be 0, 1, 2 …, special tokens first")
         policy = assemble_policy(model, language, word_tokenizer(words), questions)
-        sensors = tuple(sensor.name for sensor in language.sensors)
-        if tuple(config["sensors"]) != sensors:
+        if tuple(config["sensors"]) != (sensors := tuple(sensor.name for sensor in language.sensors)):
             raise ValueError(f"sensors are {config['sensors']}, its language has {sensors}")
         wanted = jax.eval_shape(functools.partial(policy.init, 0), touch_shapes(model, model.vision.image_px, sensors))
     except PolicyError:
         raise
     except MISFITS as error:
-        raise PolicyError(
-            f"policy is {folder}: its config does not fit this version ({error}); save it anew"
-        ) from error
+        told = f"policy is {folder}: its config does not fit this version ({error}); save it anew"
+        raise PolicyError(told) from error
     params = fitting(folder, _read_params(folder), wanted)
     return SavedPolicy(policy=policy, params=params, reads=reads, notes=notes, questions=questions)
 

@@ -13,6 +13,10 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated
 
+if __name__ == "__main__":
+    # nothing is written, and an exception within JAX's callback of the garbage collector would be lost
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
 import jax
 import jax.numpy as jnp
 import numpy as np

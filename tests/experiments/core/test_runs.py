@@ -184,6 +184,18 @@ def test_an_experiment_without_runs_and_an_unknown_one_are_named(tmp_path, capsy
         assert "must be a folder of this machine" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("place", ["memory://x/runs", "memory:/x"])
+@pytest.mark.parametrize(
+    "words", [["coin", "--runs-dir", "{}"], ["export", "touch-small", "{}"], ["list", "--into={}"]]
+)
+def test_what_would_end_with_the_process_is_no_place(monkeypatch, capsys, words, place):
+    monkeypatch.setattr(sys, "argv", ["experiments", *(word.format(place) for word in words)])
+    with pytest.raises(SystemExit) as stop:
+        start()
+    assert stop.value.code == 2
+    assert "is kept in the memory of this process alone; name a folder" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("words", [["sweep", "ablation_ordinal", "--into", ""], ["list", "--runs-dir="], ["list", ""]])
 def test_an_empty_word_is_not_the_current_folder(monkeypatch, capsys, words):
     monkeypatch.setattr(sys, "argv", ["experiments", *words])

@@ -26,6 +26,22 @@ def test_a_signal_raises_at_once(number):
     assert stop.value.number == number
 
 
+def load_extension(signalled: bool) -> None:
+    """Raise as pybind11 does when an extension cannot be loaded, maybe for a signal."""
+    try:
+        if signalled:
+            signal.raise_signal(signal.SIGTERM)
+    except Stopped as stopped:
+        raise ImportError("initialization failed") from stopped
+    raise ImportError("no module")
+
+
+@pytest.mark.parametrize(("signalled", "told"), [(True, Stopped), (False, ImportError)])
+def test_a_signal_while_an_extension_loads_is_no_import_error(signalled, told):
+    with pytest.raises(told), Stopping().listening():
+        load_extension(signalled)
+
+
 def test_a_closed_terminal_stops_no_run_that_nohup_started():
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:

@@ -1,6 +1,7 @@
 """The command that reads a checkpoint, and what it refuses."""
 
 import json
+from unittest.mock import Mock
 
 import jax
 import jax.numpy as jnp
@@ -46,6 +47,11 @@ def test_command_names_the_misfit_and_fails(directory, capsys):
     (directory / "config.json").write_text(json.dumps(config))
     assert Load(directory=directory).run() == 1
     assert "extra: model.layers.1.mlp.down_proj.weight" in capsys.readouterr().err
+
+
+def test_ctrl_c_is_no_traceback(directory, monkeypatch):
+    monkeypatch.setattr("touchr1_jax.models.load.load_checkpoint", Mock(side_effect=KeyboardInterrupt))
+    assert Load(directory=directory).run() == 130
 
 
 def test_weights_that_are_no_numbers_are_named(directory, capsys):

@@ -246,6 +246,27 @@ def test_whole_numbers_are_no_weights_without_their_steps(saved, tmp_path):
         read_policy(tmp_path / "p")
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda ids: ids.update(firm=ids["soft"]),
+        lambda ids: ids.update(firm=len(ids) + 7),
+        lambda ids: ids.update(firm=-1),
+        lambda ids: ids.update(firm=ids["firm"] + 0.5),
+        lambda ids: ids.update(zip(list(ids)[:2], range(1, -1, -1), strict=True)),
+    ],
+)
+def test_ids_that_name_no_order_of_words_are_refused(folder, change):
+    """Sorted, they would name words; which ones, the parameters would not know."""
+    path = folder / "tokenizer.json"
+    tokenizer = json.loads(path.read_text())
+    change(tokenizer["model"]["vocab"])
+    path.write_text(json.dumps(tokenizer))
+    sign(folder, lambda c: c["files"].update({path.name: hashlib.sha256(path.read_bytes()).hexdigest()}))
+    with pytest.raises(PolicyError, match=r"ids of the words in tokenizer\.json must be 0, 1, 2 …"):
+        read_policy(folder)
+
+
 def test_a_card_tells_the_questions_of_the_language_alone(saved, tmp_path):
     more = dataclasses.replace(saved, questions={**saved.questions, "colour": "what colour is it"})
     save_policy(tmp_path / "p", more)

@@ -132,7 +132,7 @@ def write_file(
             made = x.make() if isinstance(x, Deferred) else x
             if (made.dtype, made.shape) != (x.dtype, x.shape):
                 raise ValueError(f"{name} is {made.dtype} {made.shape}: must be {x.dtype} {x.shape}; correct it")
-            np.ascontiguousarray(made).tofile(file)
+            file.write(np.ascontiguousarray(made).reshape(-1).view(np.uint8).data)  # `tofile` hides the system's error
             progress(header[name]["data_offsets"][1], end)
     os.replace(partial, path)
 

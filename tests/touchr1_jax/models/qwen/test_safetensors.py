@@ -1,6 +1,7 @@
 """The file format, byte by byte, and files that are broken."""
 
 import json
+import resource
 import struct
 
 import jax.numpy as jnp
@@ -39,6 +40,17 @@ def test_what_is_written_is_read(tmp_path, dtype):
     for name, entry in read_header(tmp_path / "x.safetensors").items():
         np.testing.assert_array_equal(read_tensor(entry), tensors[name])
     assert [p.name for p in tmp_path.iterdir()] == ["x.safetensors"]
+
+
+def test_a_disk_that_fills_is_named_by_the_system(tmp_path):
+    """A limit on the size of files stands for it: the first tensor fits in part."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, before[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            write_file(tmp_path / "x.safetensors", {"a": np.ones(2**16, np.float32)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_types_that_no_weight_has_are_not_written(tmp_path):
