@@ -66,7 +66,7 @@ class Flag(enum.IntFlag):
     NO_CONTACT = 16
     UNSTABLE_FORCE = 32
     MARKER_LOSS = 64
-    TIME_GAP = 128
+    TIME_GAP = 128  # frames are missing before this one, or after it if it is the last
     ADHESION = 256  # touched so lightly that adhesion, which is left out, would change the contact
     SEVERAL_CONTACTS = 512  # more than one blob, where one contact was meant
     INCOMPLETE = 1024  # a measured value of this row is missing

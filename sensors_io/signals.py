@@ -1,5 +1,6 @@
 """The signals that end a program: what it has begun is closed or removed, as after Ctrl-C."""
 
+import contextlib
 import os
 import signal
 import sys
@@ -42,7 +43,10 @@ def end_as_interrupted() -> None:
         if (cause := hidden_in(error, KeyboardInterrupt)) is None:
             show(kind, error, trace)
         else:
-            os._exit(leave_interrupted(cause, "interrupted: run the same command again"))
+            status = leave_interrupted(cause, "interrupted: run the same command again")
+            with contextlib.suppress(OSError, ValueError, AttributeError):  # closed, full, or gone
+                sys.stdout.flush()
+            os._exit(status)
 
     sys.excepthook = leave
 

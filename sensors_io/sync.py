@@ -12,6 +12,7 @@ that gains less than the delay of the least delayed sample.)
 
 import collections
 import dataclasses
+from typing import NamedTuple
 
 from sensors_io.clock import NS_PER_S
 
@@ -19,14 +20,14 @@ from sensors_io.clock import NS_PER_S
 class ClockMap:
     """Maps the stamps of one device to the host's clock by the running minimum of their difference.
 
-    A clock by which all samples of a second came over a quarter of a second late stands still or runs slow: its samples
-    have the time of their arrival from then on, until it restarts.
+    A clock stands still or runs slow if, within a second, it fell behind by over 3 % and all samples came over ¼ s late
+    by it; the samples of the next second then have the time of their arrival.
 
     Args:
       window_s: how long a difference is remembered.
     """
 
-    _LATE_NS = NS_PER_S // 4
+    _LATE_NS, _BEHIND_NS = NS_PER_S // 4, NS_PER_S * 3 // 100
 
     def __init__(self, window_s: float = 10.0):
         if window_s <= 0:
@@ -34,8 +35,7 @@ class ClockMap:
         self._window_ns = round(window_s * NS_PER_S)
         self._rising: collections.deque[tuple[int, int]] = collections.deque()  # (host, difference), both ascending
         self._last_device_ns: int | None = None
-        self._least: int | None = None  # delay of a sample since a second's beginning
-        self._until_ns = 0
+        self._second: _Second | None = None
         self.restarts = 0
         self.slow = False
 
@@ -48,7 +48,7 @@ class ClockMap:
         """
         if self._last_device_ns is not None and device_ns < self._last_device_ns:
             self._rising.clear()
-            self._least, self.slow = None, False
+            self._second, self.slow = None, False
             self.restarts += 1
         self._last_device_ns = device_ns
         difference = host_ns - device_ns
@@ -57,15 +57,29 @@ class ClockMap:
         self._rising.append((host_ns, difference))
         while self._rising[0][0] < host_ns - self._window_ns:
             self._rising.popleft()
-        self._judge(difference - self._rising[0][1], host_ns)
+        self._judge(difference, host_ns)
         return host_ns if self.slow else device_ns + self._rising[0][1]
 
-    def _judge(self, late_ns: int, host_ns: int) -> None:
-        """Take the delay of a sample into account; of those that a stall held up others came soon."""
-        if self._least is None or host_ns >= self._until_ns:
-            self.slow |= self._least is not None and self._least > self._LATE_NS
-            self._least, self._until_ns = late_ns, host_ns + NS_PER_S
-        self._least = min(self._least, late_ns)
+    def _judge(self, difference_ns: int, host_ns: int) -> None:
+        """Judge the clock at the end of each second without a pause; a link that is late falls behind once only."""
+        late_ns, second = difference_ns - self._rising[0][1], self._second
+        if second is None or host_ns - second.last_ns > NS_PER_S:
+            self._second = _Second(host_ns, host_ns, difference_ns, late_ns)
+            return
+        least = min(second.least_ns, late_ns)
+        self._second = second._replace(last_ns=host_ns, least_ns=least)
+        if host_ns - second.began_ns >= NS_PER_S:
+            self.slow = least > self._LATE_NS and difference_ns - second.difference_ns > self._BEHIND_NS
+            self._second = _Second(host_ns, host_ns, difference_ns, late_ns)
+
+
+class _Second(NamedTuple):
+    """Arrival of the first and of the last sample of a second, the first one's difference, and the least delay."""
+
+    began_ns: int
+    last_ns: int
+    difference_ns: int
+    least_ns: int
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -110,7 +110,7 @@ def left_out_tables(lines: Iterable[Mapping[str, Any]]) -> tuple[Table, ...]:
         if updates or any(share.values()):
             named = ", ".join(f"{name.removeprefix(NONFINITE_IN)} {x:.1%}" for name, x in share.items() if x)
             rows.append({"stage": stage, "steps": len(of_stage), "updates left out": updates, "groups left out": named})
-    note = "A gradient, or a reward in the named share of the groups, was NaN or infinite."
+    note = "A gradient, the policy after it, or a reward in the named share of the groups, was NaN or infinite."
     return (named_table("Left out of training", rows, note=note),) if rows else ()
 
 

@@ -53,7 +53,9 @@ class Stopping:
         try:
             yield
         except ImportError as error:  # of an extension that was loading when the signal came
-            raise (hidden_in(error, Stopped) or error) from error.__cause__
+            if (stopped := hidden_in(error, Stopped)) is None:
+                raise
+            raise stopped from None
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0)
             sys.unraisablehook = report

@@ -29,7 +29,7 @@ from sensors_io.devices.errors import (
 )
 from sensors_io.sync import ClockMap, CounterStep, IndexGaps, PeriodGaps
 
-_ONLY_SEEN_NS = NS_PER_S // 4  # of nothing but numbers that were seen before: the counter began anew
+_REPEATED_NS = NS_PER_S // 4  # for which all numbers were seen before: the counter began anew
 _CLOCK_SET_NS = 10 * NS_PER_S  # between two clocks since the last sample: no buffer holds one back for so long
 
 
@@ -94,10 +94,11 @@ class Intake:
         self._newest: Sample | None = None
         self._error: DeviceError | None = None
         self._clock_map = ClockMap()
+        self._device = "a device"
         self._index_gaps = IndexGaps()
         self._period_gaps: PeriodGaps | None = None
         self._stamps: tuple[int, int] | None = None  # of the last sample, on the device's clock and on the host's
-        self._new_ns = 0  # arrival of the last number that was not seen before
+        self._repeated_ns: int | None = None  # arrival of the first repeated number since the last new one
         self._away = False
         self._broken_since = 0  # the last whole sample
         self._warned_at = 0
@@ -105,6 +106,7 @@ class Intake:
     def opened(self, identity: Identity) -> None:
         """Take note that the device was opened, for the first time or again."""
         with self._changed:
+            self._device = f"{identity.sensor} {identity.serial}".strip()
             if self._away:
                 self._counts.reconnects += 1
             else:
@@ -268,10 +270,12 @@ class Intake:
         by_index = CounterStep(restarted=True)
         if sample.index is not None:
             by_index = self._index_gaps.step(sample.index, reopened=self._away)
-            if by_index.duplicate and sample.host_time_ns - self._new_ns > _ONLY_SEEN_NS:
-                by_index = self._index_gaps.step(sample.index, reopened=True)
+            if by_index.duplicate:
+                since = self._repeated_ns = sample.host_time_ns if self._repeated_ns is None else self._repeated_ns
+                if sample.host_time_ns - since > _REPEATED_NS:
+                    by_index = self._index_gaps.step(sample.index, reopened=True)
             if not (by_index.duplicate or by_index.late):
-                self._new_ns = sample.host_time_ns
+                self._repeated_ns = None
         if self._period_gaps is None or by_index.duplicate or by_index.late:
             return by_index if sample.index is not None else CounterStep()
         by_period = self._by_period(self._period_gaps, sample)
@@ -309,8 +313,8 @@ class Intake:
         mapped = self._clock_map.to_host_ns(sample.device_time_ns, sample.host_time_ns)
         if self._clock_map.slow and not before:
             warnings.warn(
-                "the stamps of a device stand still, or run slower than this machine's clock: its samples are timed by "
-                "their arrival; look at the clock of its program",
+                f"{self._device}: its stamps fall behind this machine's clock, and its samples come late by them: they "
+                "are timed by their arrival; look at the clock of its program, and at the link",
                 WrongRateWarning,
                 stacklevel=3,
             )

@@ -143,7 +143,7 @@ class _RateCheck:
         self._first_ns: int | None = None
         self._number = self._records = 0  # the last number, and how far it lies behind the first
         self._least: int | None = None
-        self._usual: int | None = None  # the least of the first quarter of a second
+        self._usual: int | None = None  # the least of the first half of a second
         self._until_ns = 0
         self.measured_hz: float | None = None
 
@@ -159,7 +159,8 @@ class _RateCheck:
         self._least = late_ns if self._least is None else min(self._least, late_ns)
         if arrival_ns < self._until_ns:
             return
-        self._usual = self._least if self._usual is None else self._usual  # the very first record may have waited
+        if self._usual is None or elapsed_ns < 3 * self._EVERY_NS:  # the very first record may have waited
+            self._usual = self._least if self._usual is None else min(self._usual, self._least)
         if abs(self._least - self._usual) > self._ALLOWED_NS + self._DRIFT * elapsed_ns:
             self.measured_hz = self._records * NS_PER_S / elapsed_ns
         self._least, self._until_ns = None, arrival_ns + self._EVERY_NS

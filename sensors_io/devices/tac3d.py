@@ -23,7 +23,7 @@ PERIOD_S = 0.0327
 """Time between two messages of the vendor's recordings."""
 
 _LARGEST = 65_535  # bytes of a UDP datagram
-_SILENT_NS = round(3 * PERIOD_S * NS_PER_S)  # of a sender: then another one of its serial is taken
+_SILENT_NS = round(0.6 * NS_PER_S)  # of a sender, as of a lost device: then another one of its serial is taken
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -111,6 +111,7 @@ class Tac3dSensor:
             if message.initialised < 100:  # its fields are not measured yet
                 starting = f"; its program has started to {message.initialised} %"
             elif not self._is_second(sender, stamp_ns):
+                self._warned &= sender == self._sender
                 self._serial, self._sender, self._heard_ns = message.serial, sender, stamp_ns
                 return Sample(
                     host_time_ns=stamp_ns,

@@ -29,7 +29,7 @@ def is_cut_off(path: pathlib.Path, stated: int, count: int) -> bool:
     with path.open("rb") as file:
         try:
             return _is_cut_off(memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)), stated, count)
-        except (*MALFORMED, StopIteration):
+        except (*MALFORMED, StopIteration, OSError):  # the last: of file systems that map no files
             return count < stated
 
 
@@ -38,7 +38,7 @@ def _is_cut_off(data: memoryview, stated: int, count: int) -> bool:
     fragmented = any(kind == b"mvex" for kind, _ in _boxes(moov))
     try:
         *_, (last, _) = top = list(_boxes(data))
-    except ValueError:
+    except (ValueError, struct.error):
         return fragmented or count < stated  # else bytes may follow that are no box
     tracks = (body for kind, body in _boxes(moov) if kind == b"trak")
     track = next(body for body in tracks if _at(body, b"mdia", b"hdlr")[8:12] == b"vide")
@@ -70,8 +70,16 @@ def _boxes(data: memoryview) -> Iterator[tuple[bytes, memoryview]]:
 
 
 def _at(data: memoryview, *kinds: bytes) -> memoryview:
+    """The body of a box within boxes.
+
+    Raises:
+      ValueError: there is none.
+    """
     for kind in kinds:
-        data = next(body for other, body in _boxes(data) if other == kind)
+        found = next((body for other, body in _boxes(data) if other == kind), None)
+        if found is None:
+            raise ValueError(f"there is no box {kind!r}")
+        data = found
     return data
 
 

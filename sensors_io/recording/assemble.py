@@ -20,7 +20,7 @@ from sensors_io.recording.journal import JournalEntry, JournalError, read_journa
 from sensors_io.schema import FRAME_ARRAYS, ContactKey, Flag, Sequence
 
 _GAP_PERIODS = 1.5  # between two frames: one is missing
-_SILENT_S = 1.0  # before the first frame or after the last of a contact: longer than a device is silent and not lost
+_SILENT_S = 1.0  # before the first frame or after the last of a contact: a device is taken as lost sooner
 _INT64 = np.iinfo(np.int64)
 _MADE_HERE = ("frames", "host_time_ns", "device_time_ns", "force_time_ns", "target_force_n", "phase", "flags")
 
@@ -93,10 +93,11 @@ def _assembled(start: Mapping[str, Any], entries: Seq[JournalEntry], torn: int) 
 
 
 def _span_ns(entries: Seq[JournalEntry]) -> tuple[int, int]:
-    """First and last moment of a contact, by the phases and frames of all sensors, and the last one by the force."""
-    times = [e.plain["time_ns"] for e in entries if e.kind in ("phase", "frame")]
+    """First and last moment of a contact: of its phases, since frames may be older, and of all that was measured."""
+    phases = [e.plain["time_ns"] for e in entries if e.kind == "phase"]
+    frames = [e.plain["time_ns"] for e in entries if e.kind == "frame"]
     force = [int(e.arrays["time_ns"][-1]) for e in entries if e.kind == "force"]
-    return min(times), max(times + force)
+    return min(phases or frames), max(phases + frames + force)
 
 
 def background_name(key: ContactKey, sensor: str) -> pathlib.Path:
@@ -135,7 +136,8 @@ class _Shared:
         own = _own_arrays(frames)
         gaps = _gaps(time_ns, [e.plain["index"] for e in frames], identity["period_s"])
         silent_s = self._silent_s(time_ns, identity["period_s"])
-        gaps[[0, -1]] |= [s > 0 for s in silent_s]
+        gaps[0] |= silent_s[0] > 0
+        gaps[-1] |= silent_s[1] > 0
         force = _Force.at(time_ns, self.entries if number == 0 else ())
         flags = np.where(gaps | force.uncovered, np.uint32(Flag.TIME_GAP), np.uint32(0))
         arrays: dict[str, Any] = {**own, **force.arrays}

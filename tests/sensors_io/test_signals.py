@@ -67,6 +67,7 @@ import signal
 signal.signal(signal.SIGINT, signal.default_int_handler)
 from sensors_io.signals import end_as_interrupted
 end_as_interrupted()
+print("printed before")
 try:
     signal.raise_signal({number})
 except BaseException as error:
@@ -74,6 +75,7 @@ except BaseException as error:
 """
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stderr) == (128 + number, "interrupted: run the same command again\n")
+    assert ended.stdout == "printed before\n"
 
 
 def test_a_signal_that_is_ignored_stays_so():

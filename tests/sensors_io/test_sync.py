@@ -64,6 +64,22 @@ def test_samples_that_a_stall_held_up_are_no_slow_clock(stall_s):
         assert np.abs(mapped - device).max() == 0
 
 
+@pytest.mark.parametrize("late_s", [0.4, 2.0])
+def test_a_link_that_is_late_for_some_seconds_or_a_late_sample_before_a_pause_is_no_slow_clock(late_s):
+    device = np.arange(0, 20 * NS_PER_S, 33 * MS)
+    for begin in np.arange(5, 6, 0.05):
+        clock, first = ClockMap(), round(begin * NS_PER_S)
+        delays = np.where((device >= first) & (device < first + 3 * NS_PER_S), round(late_s * NS_PER_S), 0)
+        arrival = np.maximum.accumulate(device + delays)
+        mapped = [clock.to_host_ns(int(d), int(h)) for d, h in zip(device, arrival, strict=True)]
+        assert np.count_nonzero(mapped - device) <= 62  # the seconds in which the link falls behind and catches up
+        clock, late = ClockMap(), device[device < first]
+        for d in late:
+            clock.to_host_ns(int(d), int(d) + (round(late_s * NS_PER_S) if d == late[-1] else 0))
+        clock.to_host_ns(int(late[-1]) + 4 * NS_PER_S, int(late[-1]) + 4 * NS_PER_S)
+        assert not clock.slow
+
+
 @given(st.lists(st.tuples(st.integers(0, 5), st.booleans()), min_size=1, max_size=60), st.sampled_from([None, 256]))
 def test_drops_and_duplicates_of_a_counter_are_all_found(plan, modulus):
     """Each entry: how many are dropped before a sample, and whether it comes twice."""

@@ -92,7 +92,7 @@ class GatedMLP(nn.Module):
 
 @jax.custom_vjp
 def gated(gate: Float[Array, "*n D"], up: Float[Array, "*n D"]) -> Float[Array, "*n D"]:
-    """silu(gate) ⊙ up; the gradient computes σ(gate) again, which XLA on CPU would store and read three times."""
+    """silu(gate) ⊙ up; the gradient, in reverse mode alone, computes σ(gate) again, which XLA on CPU would store."""
     return nn.silu(gate) * up
 
 

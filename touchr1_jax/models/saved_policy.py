@@ -202,8 +202,8 @@ def read_policy(folder: Path) -> SavedPolicy:
     except PolicyError:
         raise
     except MISFITS as error:
-        told = f"policy is {folder}: its config does not fit this version ({error}); save it anew"
-        raise PolicyError(told) from error
+        misfit = f"policy is {folder}: its config does not fit this version ({error}); save it anew"
+        raise PolicyError(misfit) from error
     params = fitting(folder, _read_params(folder), wanted)
     return SavedPolicy(policy=policy, params=params, reads=reads, notes=notes, questions=questions)
 

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated
 
-if __name__ == "__main__":
+if __name__ == "__main__" and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     # nothing is written, and an exception within JAX's callback of the garbage collector would be lost
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 

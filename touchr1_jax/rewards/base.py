@@ -111,7 +111,8 @@ def total_reward(
     """
     check_weights(rewards, weights)
     found = {name: reward_value(name, rewards[name], parsed, target, tokens, decode) for name in weights}
-    values = {name: jnp.asarray(value, jnp.float32) for name, value in found.items()}  # 16 bits would round the weight
+    wide = lambda x: jnp.asarray(x, jnp.promote_types(jnp.result_type(x), jnp.float32))  # 16 bits would round weights
+    values = {name: wide(value) for name, value in found.items()}
     applies = {name: _checked(name, "applies", jnp.bool_, (), rewards[name].applies, target) for name in weights}
     share = {name: jnp.where(applies[name], weight, 0.0) for name, weight in weights.items()}
     in_force = sum(share.values())

@@ -51,7 +51,8 @@ class NonFiniteGradientError(RuntimeError):
 class LoopConfig:
     """Number of steps, steps between checkpoints, and how many updates in a row may be left out.
 
-    An update is left out if its gradient, or the policy after it, is not finite (see `skipping`).
+    An update is left out if its gradient, or the policy after it, is not finite (see `skipping`); of several updates in
+    a step each counts.
     """
 
     steps: int

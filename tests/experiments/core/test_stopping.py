@@ -36,9 +36,9 @@ def load_extension(signalled: bool) -> None:
     raise ImportError("no module")
 
 
-@pytest.mark.parametrize(("signalled", "told"), [(True, Stopped), (False, ImportError)])
-def test_a_signal_while_an_extension_loads_is_no_import_error(signalled, told):
-    with pytest.raises(told), Stopping().listening():
+@pytest.mark.parametrize(("signalled", "raised"), [(True, Stopped), (False, ImportError)])
+def test_a_signal_while_an_extension_loads_is_no_import_error(signalled, raised):
+    with pytest.raises(raised), Stopping().listening():
         load_extension(signalled)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sensors_io.devices.sources import VideoFile
+from sensors_io.importers import mp4
 from sensors_io.importers.keep import Keep
 from sensors_io.importers.video import VideoError, read_video
 from tests.sensors_io.checks import refused
@@ -85,9 +86,13 @@ def test_an_mp4_in_fragments_is_whole_whatever_its_sound_and_refused_where_it_is
     path = uneven_film(tmp_path / "a.mp4", range(0, 2000, 40), 4.0, movflags="frag_keyframe+empty_moov")
     assert read_video(path, Keep(**WHOLE)).total == 50
     data = path.read_bytes()
-    for end in (data.rindex(b"mfra") - 4, data.rindex(b"mdat") - 4, *range(len(data) - 1, 1000, -499)):
+    ends = data.rindex(b"mfra"), data.rindex(b"mdat") - 4
+    for end in (*ends, ends[0] - 4, *range(len(data) - 1, 1000, -499)):
         path.write_bytes(data[:end])
         refused(VideoError, "is cut off|no frame|not open", read_video, path, Keep(**WHOLE))
+    for box in (b"hdlr", b"tfhd", b"stbl"):
+        path.write_bytes(data.replace(box, b"free"))
+        assert not mp4.is_cut_off(path, 50, 50)
 
 
 @pytest.mark.parametrize("cut_off", [0, 1])

@@ -150,6 +150,13 @@ def test_a_sensor_that_is_silent_at_either_end_of_a_contact_is_flagged_and_count
     assert gaps.tolist() == [range(len(made))[n] for n in marked]
 
 
+def test_a_slow_camera_does_not_make_the_others_silent(tmp_path):
+    hand = Hand()
+    cameras = [Camera(hand), Partly(hand, lambda n: n % 12 == 0)]
+    report = record_session(tmp_path, dataclasses.replace(CONFIG, free_s=4.0), cameras, None, show=hand.show)
+    assert not +report.silent
+
+
 def test_a_contact_that_cannot_be_stored_keeps_its_journal_and_later_sessions_go_on(tmp_path, monkeypatch):
     refuse = lambda writer, sequences: (_ for _ in ()).throw(SchemaError("frames is None: refused for the test"))
     kept = ["cup-0-press-0.refused", "cup-0-press-0.2.refused", "cup-0-press-0.3.refused"]

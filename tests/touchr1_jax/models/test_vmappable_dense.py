@@ -29,8 +29,9 @@ def batched(product, w, x):
 
 
 @pytest.mark.parametrize("of", [value, batched])
-def test_value_and_gradients_are_those_of_the_plain_product(of):
-    ours, theirs = (jax.value_and_grad(lambda w, x, p=p: of(p, w, x), (0, 1))(W, X) for p in (linear, jnp.matmul))
+@pytest.mark.parametrize("weight", [W, W[:, :3]], ids=["wider", "narrower"])
+def test_value_and_gradients_are_those_of_the_plain_product(of, weight):
+    ours, theirs = (jax.value_and_grad(lambda w, x, p=p: of(p, w, x), (0, 1))(weight, X) for p in (linear, jnp.matmul))
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6)
 

@@ -95,6 +95,7 @@ NO_FAILURE = {
     "all right in all groups": {"drawn_unsolved_share": 0.0, "drawn_idle_share": 0.0},
     "constant groups, and answers get better": {"drawn_idle_share": 0.4, "drawn_accuracy": 0.75},
     "a lower entropy": {"entropy": 0.035},
+    "41 prompts with touch, whose mean is rounded": {"touch_share": 0.99999994},
     "a stream that counts little": {"grounding_stream_1": 1.5e-7},
     "low entropy of right answers": {"entropy": 0.01, "drawn_accuracy": 0.99},
     "low entropy of better answers": {"entropy": 0.01, "drawn_accuracy": 0.85},
