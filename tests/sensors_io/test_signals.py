@@ -73,7 +73,8 @@ try:
 except BaseException as error:
     raise ImportError("initialization failed") from error
 """
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    env = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=env)
     assert (ended.returncode, ended.stderr) == (128 + number, "interrupted: run the same command again\n")
     assert ended.stdout == "printed before\n"
 

@@ -150,11 +150,18 @@ def test_a_sensor_that_is_silent_at_either_end_of_a_contact_is_flagged_and_count
     assert gaps.tolist() == [range(len(made))[n] for n in marked]
 
 
-def test_a_slow_camera_does_not_make_the_others_silent(tmp_path):
+def test_old_frames_of_a_camera_do_not_make_the_others_silent(tmp_path):
+    class Stale(Camera):
+        """Its first frame is ten seconds old."""
+
+        def drain(self):
+            return [
+                dataclasses.replace(s, host_time_ns=s.host_time_ns - (s.index == 1) * 10**10) for s in super().drain()
+            ]
+
     hand = Hand()
-    cameras = [Camera(hand), Partly(hand, lambda n: n % 12 == 0)]
-    report = record_session(tmp_path, dataclasses.replace(CONFIG, free_s=4.0), cameras, None, show=hand.show)
-    assert not +report.silent
+    cameras = [Camera(hand), Stale(hand, "digit")]
+    assert not +record_session(tmp_path, SHORT, cameras, Scale(hand), show=hand.show).silent
 
 
 def test_a_contact_that_cannot_be_stored_keeps_its_journal_and_later_sessions_go_on(tmp_path, monkeypatch):
