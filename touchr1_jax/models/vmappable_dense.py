@@ -92,13 +92,15 @@ def _for_input(g: Array, x: Any, w: Array) -> Array:
 
 
 def _for_weight(g: Array, x: Array, w: Any) -> Array:
-    """xᵀ g, or (gᵀ x)ᵀ where x is wider: on CPU, XLA reads the narrow operand by columns twice as fast.
+    """xᵀ g, on CPU (gᵀ x)ᵀ where x is wider: XLA reads the narrow operand by columns twice as fast there.
 
     The barrier keeps XLA from turning the product back.
     """
     del w
     columns = lambda a, b: jax.lax.dot_general(_rows(a), _rows(b), (((0,), (0,)), ((), ())))
-    return columns(x, g) if x.shape[-1] <= g.shape[-1] else jax.lax.optimization_barrier(columns(g, x)).T
+    if x.shape[-1] <= g.shape[-1] or jax.default_backend() != "cpu":
+        return columns(x, g)
+    return jax.lax.optimization_barrier(columns(g, x)).T
 
 
 def _batched(operands: Sequence[Array], axes: Sequence[int | None]) -> tuple[Array, int]:
