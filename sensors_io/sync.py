@@ -21,7 +21,7 @@ class ClockMap:
     """Maps the stamps of one device to the host's clock by the running minimum of their difference.
 
     A clock stands still or runs slow if, within a second, it fell behind by over 3 % and all samples came over ¼ s late
-    by it; the samples of the next second then have the time of their arrival.
+    by it.  Samples then have the time of their arrival, until one came sooner and its time is not before the last.
 
     Args:
       window_s: how long a difference is remembered.
@@ -36,6 +36,7 @@ class ClockMap:
         self._rising: collections.deque[tuple[int, int]] = collections.deque()  # (host, difference), both ascending
         self._last_device_ns: int | None = None
         self._second: _Second | None = None
+        self._arrived_ns: int | None = None  # the time of the last sample, if it is that of its arrival
         self.restarts = 0
         self.slow = False
 
@@ -58,7 +59,12 @@ class ClockMap:
         while self._rising[0][0] < host_ns - self._window_ns:
             self._rising.popleft()
         self._judge(difference, host_ns)
-        return host_ns if self.slow else device_ns + self._rising[0][1]
+        taken_ns = device_ns + self._rising[0][1]
+        if self.slow or (self._arrived_ns is not None and taken_ns < self._arrived_ns):
+            self._arrived_ns = host_ns
+            return host_ns
+        self._arrived_ns = None
+        return taken_ns
 
     def _judge(self, difference_ns: int, host_ns: int) -> None:
         """Judge the clock at the end of each second without a pause; a link that is late falls behind once only."""
@@ -69,7 +75,8 @@ class ClockMap:
         least = min(second.least_ns, late_ns)
         self._second = second._replace(last_ns=host_ns, least_ns=least)
         if host_ns - second.began_ns >= NS_PER_S:
-            self.slow = least > self._LATE_NS and difference_ns - second.difference_ns > self._BEHIND_NS
+            fell_behind = difference_ns - second.difference_ns > self._BEHIND_NS
+            self.slow = least > self._LATE_NS and (self.slow or fell_behind)
             self._second = _Second(host_ns, host_ns, difference_ns, late_ns)
 
 

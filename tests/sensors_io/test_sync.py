@@ -80,6 +80,18 @@ def test_a_link_that_is_late_for_some_seconds_or_a_late_sample_before_a_pause_is
         assert not clock.slow
 
 
+@pytest.mark.parametrize("late_s", [0.3, 0.6, 2.0])
+def test_times_never_run_backward_where_a_link_gets_slower_and_recovers(late_s):
+    device = np.arange(0, 30 * NS_PER_S, 33 * MS)
+    for begin in np.arange(5, 6, 0.05):
+        delays = late_s * np.interp(device / NS_PER_S, begin + np.array([0, 4, 9, 11]), [0, 1, 1, 0])
+        arrival = np.maximum.accumulate(device + (delays * NS_PER_S).astype(int))
+        clock = ClockMap()
+        mapped = [clock.to_host_ns(int(d), int(h)) for d, h in zip(device, arrival, strict=True)]
+        assert np.diff(mapped).min() >= 0
+        assert not clock.slow
+
+
 @given(st.lists(st.tuples(st.integers(0, 5), st.booleans()), min_size=1, max_size=60), st.sampled_from([None, 256]))
 def test_drops_and_duplicates_of_a_counter_are_all_found(plan, modulus):
     """Each entry: how many are dropped before a sample, and whether it comes twice."""
