@@ -375,7 +375,8 @@ class AlarmMonitor:
     def update(self, metrics: Metrics, *, left_out: bool = False) -> list[Alarm]:
         """The alarms after one more step; before the first window is full, only those that judge single steps.
 
-        Metrics of a step of which an update was `left_out`, or counted in `lost_updates`, may not be finite or empty.
+        Where an update was `left_out`, or `lost_updates` counts one, only alarms of single steps judge the step, whose
+        metrics may be missing or not finite.
         """
         left_out = left_out or metrics.get("lost_updates", 0.0) > 0
         self._left_out.append(left_out)
