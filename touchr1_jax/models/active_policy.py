@@ -17,10 +17,11 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.models.layers import MASKED
-from touchr1_jax.models.lm import CompletionCaches, DecoderConfig, PrefixCache
+from touchr1_jax.models.lm import DecoderConfig, PrefixCache
 from touchr1_jax.models.policy import Features, Policy, PolicyConfig, Slots
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.tactile_vit import TactileViTConfig
+from touchr1_jax.models.token_cache import CompletionCaches
 from touchr1_jax.models.vision import VisionConfig
 from touchr1_jax.text.language import EXPLORED_ATTRIBUTES, Attribute
 from touchr1_jax.text.template import LevelTokens, level_tokens

@@ -5,20 +5,21 @@ rollouts shares one prompt, so the keys of the prompt (`PrefixCache`) are an arg
 `vmap` over it, leaves as it is.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.models.blocked_attention import LayerCache, Segments, attend_causally, attend_in_segments
 from touchr1_jax.models.decoder_config import DecoderConfig
 from touchr1_jax.models.deepstack import Levels, add_level
 from touchr1_jax.models.layers import MASKED, GatedMLP, KeySource, RMSNorm, Rotation, attend, mrope, rotate
-from touchr1_jax.models.stacked import scan_layers
+from touchr1_jax.models.stacked import ADAPTERS, before_the_loop, scan_layers
+from touchr1_jax.models.token_cache import CompletionCaches, TokenCache, grown, layer_of, turned, write_rows
 from touchr1_jax.models.vmappable_dense import Dense, Embed, product_with_weights
 
 
@@ -28,11 +29,6 @@ class Caches(NamedTuple):
 
     layers: LayerCache | None  # none in a decoder of one layer
     last: LayerCache
-
-
-CompletionCaches = tuple[LayerCache, ...]
-"""Keys and values of the tokens after a prompt, [KV, T, d] of each layer; in a deep decoder those before the last are a
-stack, [layer, KV, T, d]."""
 
 
 class PrefixCache(NamedTuple):
@@ -245,7 +241,7 @@ class Decoder(nn.Module):
         """Hidden state of completion token t, and the caches with its row written (the sampler's forward pass)."""
         x = self.embed(token[None])
         rotation = self._rotation(jnp.broadcast_to(prefix.next_position + t, (3, 1)))
-        seen = jnp.arange(caches[-1].k.shape[-2]) <= t
+        seen = jnp.arange(caches[-1].v.shape[-2]) <= t
         x, caches = self._append(x, rotation, t, prefix, caches, seen)
         return x[0], caches
 
@@ -273,7 +269,7 @@ class Decoder(nn.Module):
         """
         n, rows = x.shape[0], seen.shape[0]
         rotation = self._rotation(_text_positions(prefix.next_position + jnp.sum(seen), exists))
-        seen = _write_rows(seen[None, :, None], exists[None, :, None], None, t)[0, :, 0]
+        seen = write_rows(seen[None, :, None], exists[None, :, None], None, t)[0, :, 0]
         mask = seen & (jnp.arange(rows) <= t + jnp.arange(n)[:, None])
         return *self._append(x, rotation, t, prefix, caches, mask), seen
 
@@ -313,21 +309,23 @@ class Decoder(nn.Module):
         """Tokens through all layers, their keys and values written from row t on."""
 
         apart = len(caches) == self.config.num_layers
+        once = before_the_loop if apart else lambda x: x
 
-        def each(layer: DecoderLayer, x: Any, past: LayerCache, cache: LayerCache, i: Any = None) -> Any:
+        def each(layer: DecoderLayer, x: Any, past: LayerCache, cache: TokenCache, i: Any = None) -> Any:
             q, row = layer.project(x, rotation)
-            cache = jax.tree.map(lambda rows, new: _write_rows(rows, new, i, t), cache, row)
-            own = cache if i is None else _layer_of(cache, i)
-            keys = [KeySource(past.k, past.v, prefix.mask), KeySource(own.k, own.v, seen)]
-            return layer.finish(x, attend(q, keys)), cache
+            cache = grown(cache, row, i, t)
+            own = cache if i is None else layer_of(cache, i)
+            before = KeySource(turned(once(turned(past.k))), past.v, prefix.mask)
+            return layer.finish(x, attend(q, [before, KeySource(turned(own.k), own.v, seen)])), cache
 
         def scanned(layer: DecoderLayer, carry: Any, i: Int[Array, ""]) -> tuple[Any, None]:
             x, (cache, *others) = carry  # the caches are carried and not mapped over, so that they are written in place
-            x, cache = each(layer, x, _layer_of(prefix.caches.layers, i), cache, None if apart else i)
+            x, cache = each(layer, x, layer_of(prefix.caches.layers, i), cache, None if apart else i)
             return (x, (*others, cache)), None  # the cache of the next layer comes to the front
 
         *before, last = caches
-        (x, before), _ = self._scan(scanned, (x, tuple(before)), jnp.arange(self.config.num_layers - 1))
+        layer_step = nn.map_variables(scanned, ("params", ADAPTERS), functools.partial(jax.tree.map, once))
+        (x, before), _ = self._scan(layer_step, (x, tuple(before)), jnp.arange(self.config.num_layers - 1))
         x, last = each(self.last_layer, x, prefix.caches.last, last)
         return x, (*before, last)
 
@@ -351,29 +349,3 @@ def _text_positions(first: Int[Array, ""], exists: Bool[Array, "n"]) -> Int[Arra
 def _after(positions: Int[Array, "3 L"], mask: Bool[Array, "L"]) -> Int[Array, ""]:
     """The position that follows a prompt."""
     return jnp.max(jnp.where(mask, positions, -1)) + 1
-
-
-def _layer_of(stack: Any, i: int | Int[Array, ""]) -> LayerCache:
-    return jax.tree.map(lambda rows: jax.lax.dynamic_index_in_dim(rows, i, keepdims=False), stack)
-
-
-@custom_vmap
-def _write_rows(cache: Array, rows: Array, i: Array | None, t: Array) -> Array:
-    """A cache [*n, KV, T, d], or layer i of a stack [*n, layer, KV, T, d], with rows [*n, KV, m, d] from t on.
-
-    It stays a slice update in place under `vmap`, where jax's own rule makes a scatter.
-    """
-    at: Any = (0, t, 0) if i is None else (i, 0, t, 0)
-    rows = rows if i is None else jnp.expand_dims(rows, -4)
-    return jax.lax.dynamic_update_slice(cache, rows, (*(0,) * (cache.ndim - len(at)), *at))
-
-
-@_write_rows.def_vmap
-def _write_rows_batched(
-    size: int, batched: list[bool], cache: Array, rows: Array, i: Array | None, t: Array
-) -> tuple[Array, bool]:
-    if batched[2] or batched[3]:
-        raise ValueError("all rows of a decoding batch are written at the same index t: do not batch t")
-    cache = cache if batched[0] else jnp.broadcast_to(cache, (size, *cache.shape))
-    rows = rows if batched[1] else jnp.broadcast_to(rows, (size, *rows.shape))
-    return _write_rows(cache, rows, i, t), True

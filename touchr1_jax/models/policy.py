@@ -22,8 +22,9 @@ from jaxtyping import Array, Bool, Float, Int
 from touchr1_jax.models.blocked_attention import Segments
 from touchr1_jax.models.deepstack import Levels, placed, split_levels
 from touchr1_jax.models.layers import RMSNorm
-from touchr1_jax.models.lm import CompletionCaches, Decoder, DecoderConfig, PrefixCache
+from touchr1_jax.models.lm import Decoder, DecoderConfig, PrefixCache
 from touchr1_jax.models.tactile_vit import TactileViTConfig, step_time
+from touchr1_jax.models.token_cache import CompletionCaches
 from touchr1_jax.types import Params, TouchBatch
 
 

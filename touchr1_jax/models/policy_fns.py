@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from touchr1_jax.models.blocked_attention import LayerCache
-from touchr1_jax.models.lm import CompletionCaches, PrefixCache
+from touchr1_jax.models.lm import PrefixCache
 from touchr1_jax.models.lora import LoraConfig, adapted
 from touchr1_jax.models.policy import Features, Policy, Row, Slots
 from touchr1_jax.models.stacked import ADAPTERS, UNROLLED
+from touchr1_jax.models.token_cache import CompletionCaches, TokenCache
 from touchr1_jax.text.template import PromptLayout
 from touchr1_jax.text.tokenizer import Tokenizer
 from touchr1_jax.types import Params, TouchBatch
@@ -152,8 +152,9 @@ class PolicyFns:
         Layers of a small decoder have one each: to attend to one of a stack copies it, for every token.
         """
         c = self.module.config.decoder
-        before, shape = c.num_layers - 1, (c.num_kv_heads, length, c.head_dim)
-        empty = lambda *n: LayerCache(*(jnp.zeros((*n, *shape), self.cache_dtype),) * 2)
+        before, heads = c.num_layers - 1, c.num_kv_heads
+        zeros = lambda *shape: jnp.zeros(shape, self.cache_dtype)
+        empty = lambda *n: TokenCache(zeros(*n, heads, c.head_dim, length), zeros(*n, heads, length, c.head_dim))
         return (empty(),) * c.num_layers if before <= UNROLLED else (empty(before), empty())
 
     def _apply(self, params: Params, method: Callable[..., Any], *args: Any) -> Any:

@@ -8,6 +8,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 ADAPTERS = "adapters"
 """Collection of variables that holds low-rank adapters of dense layers (see `models.lora`)."""
@@ -42,6 +43,16 @@ def scan_layers(each: Callable[..., tuple[Any, Any]], count: int) -> Callable[..
         unroll=count if count <= UNROLLED else 1,
         check_constancy_invariants=False,
     )
+
+
+def before_the_loop(x: Array) -> Array:
+    """The same array, which XLA on CPU makes before a loop, and not in each of its rounds.
+
+    It moves no slice of a stack and no transposition out of a loop by itself, but a barrier and all that it needs.
+    Arrays in bfloat16 stay in the loop (see `LAYER_BY_LAYER`).
+    """
+    moves = x.dtype != jnp.bfloat16 and jax.default_backend() == "cpu"
+    return jax.lax.optimization_barrier(x) if moves else x
 
 
 def layer_by_layer(weights: Any) -> dict[str, Any]:

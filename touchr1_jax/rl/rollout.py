@@ -16,10 +16,11 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.models.layers import TEMPERATURES
-from touchr1_jax.models.lm import CompletionCaches, PrefixCache
+from touchr1_jax.models.lm import PrefixCache
 from touchr1_jax.models.policy import Features
 from touchr1_jax.models.policy_fns import PolicyFns
 from touchr1_jax.models.stacked import layer_by_layer
+from touchr1_jax.models.token_cache import CompletionCaches
 from touchr1_jax.rl.losses import token_log_probs
 from touchr1_jax.text.constraint import Constraint
 from touchr1_jax.types import Params, Parsed, Rollout, Target

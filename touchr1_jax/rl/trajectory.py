@@ -15,7 +15,8 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from touchr1_jax.models.active_policy import ActiveFns
-from touchr1_jax.models.lm import CompletionCaches, PrefixCache
+from touchr1_jax.models.lm import PrefixCache
+from touchr1_jax.models.token_cache import CompletionCaches
 from touchr1_jax.rl.environment import Environment
 from touchr1_jax.rl.rollout import GRPOBatch, SampleConfig, any_alive, draw_token, drawn_log_probs, tempered
 from touchr1_jax.text.turns import ANY_TURN, LAST_TURN

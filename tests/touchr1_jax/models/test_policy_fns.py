@@ -145,7 +145,8 @@ def test_empty_cache_has_the_shape_of_the_decoder(layers, stacks):
     policy = dataclasses.replace(tiny.CONFIG, decoder=c)
     fns = dataclasses.replace(tiny.FNS, module=dataclasses.replace(tiny.FNS.module, config=policy))
     shapes = [(x.k.shape, x.v.shape) for x in fns.empty_cache(7)]
-    assert shapes == [((*n, c.num_kv_heads, 7, c.head_dim),) * 2 for n in stacks]
+    heads = [(*n, c.num_kv_heads) for n in stacks]
+    assert shapes == [((*h, c.head_dim, 7), (*h, 7, c.head_dim)) for h in heads]
 
 
 @pytest.mark.long
