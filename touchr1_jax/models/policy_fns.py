@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool, Float, Int
 from touchr1_jax.models.lm import PrefixCache
 from touchr1_jax.models.lora import LoraConfig, adapted
 from touchr1_jax.models.policy import Features, Policy, Row, Slots
-from touchr1_jax.models.stacked import ADAPTERS, UNROLLED
-from touchr1_jax.models.token_cache import CompletionCaches, TokenCache
+from touchr1_jax.models.stacked import ADAPTERS
+from touchr1_jax.models.token_cache import CompletionCaches, empty_caches
 from touchr1_jax.text.template import PromptLayout
 from touchr1_jax.text.tokenizer import Tokenizer
 from touchr1_jax.types import Params, TouchBatch
@@ -147,15 +147,8 @@ class PolicyFns:
         return self._apply(params, Policy.logits, states, jnp.asarray(self.banned))
 
     def empty_cache(self, length: int) -> CompletionCaches:
-        """Caches of one completion of at most `length` tokens.
-
-        Layers of a small decoder have one each: to attend to one of a stack copies it, for every token.
-        """
-        c = self.module.config.decoder
-        before, heads = c.num_layers - 1, c.num_kv_heads
-        zeros = lambda *shape: jnp.zeros(shape, self.cache_dtype)
-        empty = lambda *n: TokenCache(zeros(*n, heads, c.head_dim, length), zeros(*n, heads, length, c.head_dim))
-        return (empty(),) * c.num_layers if before <= UNROLLED else (empty(before), empty())
+        """Caches of one completion of at most `length` tokens."""
+        return empty_caches(self.module.config.decoder, length, self.cache_dtype)
 
     def _apply(self, params: Params, method: Callable[..., Any], *args: Any) -> Any:
         whole = {**self.base, **params}

@@ -6,9 +6,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
 from touchr1_jax.models.blocked_attention import LayerCache
+from touchr1_jax.models.decoder_config import DecoderConfig
+from touchr1_jax.models.stacked import UNROLLED
 
 
 class TokenCache(NamedTuple):
@@ -23,6 +26,17 @@ class TokenCache(NamedTuple):
 
 CompletionCaches = tuple[TokenCache, ...]
 """Those of each layer; in a deep decoder those before the last are a stack, [layer, …]."""
+
+
+def empty_caches(c: DecoderConfig, length: int, dtype: DTypeLike = jnp.float32) -> CompletionCaches:
+    """Caches of at most `length` tokens.
+
+    Layers of a small decoder have one each: to attend to one of a stack copies it, for every token.
+    """
+    before, heads = c.num_layers - 1, c.num_kv_heads
+    zeros = lambda *shape: jnp.zeros(shape, dtype)
+    empty = lambda *n: TokenCache(zeros(*n, heads, c.head_dim, length), zeros(*n, heads, length, c.head_dim))
+    return (empty(),) * c.num_layers if before <= UNROLLED else (empty(before), empty())
 
 
 def grown(cache: TokenCache, row: LayerCache, i: int | Int[Array, ""] | None, t: Int[Array, ""]) -> TokenCache:

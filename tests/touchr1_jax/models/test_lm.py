@@ -1,6 +1,7 @@
 """The decoder: nothing looks ahead, and the caches are written where they should be."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +10,9 @@ import pytest
 
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.drawn import draw_params
-from touchr1_jax.models.blocked_attention import LayerCache
 from touchr1_jax.models.lm import Decoder
+from touchr1_jax.models.stacked import before_the_loop, layer_by_layer
+from touchr1_jax.models.token_cache import empty_caches
 
 CONFIG = dataclasses.replace(tiny.CONFIG.decoder, tie_embedding=False)
 DECODER = Decoder(CONFIG)
@@ -32,8 +34,7 @@ def prefill(params, x):
 
 def filled(value):
     """Caches of all layers, every entry `value`."""
-    rows = LayerCache(*(jnp.full((CONFIG.num_kv_heads, T, CONFIG.head_dim), value),) * 2)
-    return (rows,) * CONFIG.num_layers
+    return jax.tree.map(lambda x: jnp.full_like(x, value), empty_caches(CONFIG, T))
 
 
 @pytest.mark.long
@@ -57,13 +58,14 @@ def test_a_cache_for_each_layer_reads_as_one_for_all():
     params = draw_params(shapes["params"], loud=0.1)
     run = lambda method: jax.jit(lambda *args: decoder.apply({"params": params}, *args, method=method))
     prefix = run(Decoder.prefill)(x, positions, mask)[1]
-    empty = lambda *n: LayerCache(*(jnp.zeros((*n, config.num_kv_heads, T, config.head_dim)),) * 2)
+    apart, last = empty_caches(config, T), empty_caches(config, T)[-1]
+    stack = jax.tree.map(lambda x: jnp.stack([x] * before), last)
     step = run(Decoder.decode)
     found = []
-    for caches in ((empty(),) * config.num_layers, (empty(before), empty())):
+    for caches in (apart, (stack, last)):
         for t, token in enumerate(tokens):
             hidden, caches = step(token, jnp.int32(t), prefix, caches)
-        found.append((hidden, jnp.concatenate([x.k.reshape(-1, T, config.head_dim) for x in caches])))
+        found.append((hidden, jnp.concatenate([x.k.reshape(-1, config.head_dim, T) for x in caches])))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), *found)
     whole = run(Decoder.extend)(tokens, prefix)[-1]
     np.testing.assert_allclose(found[0][0], whole, atol=1e-5)
@@ -94,6 +96,18 @@ def test_decoding_a_batch_writes_the_row_that_each_alone_writes(params, cache_ax
     for i, token in enumerate(tokens):
         alone = one(token, t, fresh)
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[i], b, atol=1e-5), together, alone)
-    np.testing.assert_array_equal((together[-1].k == 5).all((0, 1, 3)), np.arange(T) != 2)
+    np.testing.assert_array_equal((together[-1].k == 5).all((0, 1, 2)), np.arange(T) != 2)
+    np.testing.assert_array_equal((together[-1].v == 5).all((0, 1, 3)), np.arange(T) != 2)
     with pytest.raises(ValueError, match="do not batch t"):
         jax.vmap(step, (None, 0, None))(tokens[0], jnp.arange(2), fresh)
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="layers are taken out of loops on CPU alone")
+@pytest.mark.parametrize(("kind", "out"), [(jnp.float32, True), (jnp.bfloat16, False)])
+def test_a_loop_does_not_take_layers_out_of_their_stack_in_every_round(kind, out):
+    def looped(stack, n):
+        layers = lambda x: functools.reduce(lambda y, w: y @ before_the_loop(w), stack, x)
+        return jax.lax.fori_loop(0, n, lambda _, x: layers(x), jnp.ones((4, 8), kind))
+
+    text = jax.jit(looped).lower(jnp.ones((3, 8, 8), kind), 5).compile(compiler_options=layer_by_layer(kind)).as_text()
+    assert ("slice" in text[text.index("\nENTRY") :]) == out

@@ -12,8 +12,8 @@ import pytest
 
 from tests.touchr1_jax.models.qwen import cases, tiny
 from tests.touchr1_jax.models.qwen.cases import CASES
-from touchr1_jax.models.blocked_attention import LayerCache
 from touchr1_jax.models.qwen.model import QwenVL
+from touchr1_jax.models.token_cache import empty_caches
 from touchr1_jax.types import Params
 
 RELATIVE = 1e-5
@@ -72,7 +72,7 @@ def test_cached_answers_are_the_full_forward_pass(name, golden, params):
     answer = whole.ids[-last:]
     close(jax.jit(lambda o, past: run(QwenVL.extend, o, past))(answer, prefix), theirs[1:])
     c = model.config.decoder
-    caches: tuple = (LayerCache(*(jnp.zeros((c.num_kv_heads, last, c.head_dim)),) * 2),) * c.num_layers
+    caches = empty_caches(c, last)
     step = jax.jit(lambda token, t, past, caches: run(QwenVL.decode, token, t, past, caches))
     for t in range(last):
         logits, caches = step(answer[t], jnp.int32(t), prefix, caches)

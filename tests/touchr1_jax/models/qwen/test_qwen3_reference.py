@@ -12,13 +12,13 @@ import pytest
 
 from tests.touchr1_jax.models.qwen import cases, tiny, words
 from tests.touchr1_jax.models.qwen.cases import CASES
-from touchr1_jax.models.blocked_attention import LayerCache
 from touchr1_jax.models.qwen import names
 from touchr1_jax.models.qwen.config_file import read_config
 from touchr1_jax.models.qwen.model import QwenVL
 from touchr1_jax.models.qwen.pictures import patchify
 from touchr1_jax.models.qwen.safetensors import read_header, read_tensor
 from touchr1_jax.models.qwen.weights import load_params, row_of, save_params
+from touchr1_jax.models.token_cache import empty_caches
 from touchr1_jax.text.chat import VISION, VISION_END, build_chat_layout, timestamps
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.text.template import QUESTIONS
@@ -82,7 +82,7 @@ def test_greedy_answers_are_those_of_transformers(reference):
     params = load_params(folder / "checkpoint", config, jnp.float32)
     run = lambda method, *args: model.apply({"params": params}, *args, method=method)
     logits, prefix = jax.jit(lambda x: run(QwenVL.prefill, x, grids))(inputs)
-    caches: tuple = (LayerCache(*(jnp.zeros((c.num_kv_heads, length, c.head_dim)),) * 2),) * c.num_layers
+    caches = empty_caches(c, length)
     tokens: list[jax.Array] = []
     step = jax.jit(lambda token, t, caches: run(QwenVL.decode, token, t, prefix, caches))
     for t in range(length):
