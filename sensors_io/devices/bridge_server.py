@@ -139,7 +139,8 @@ def pack(number, stamp_ns, serial, arrays):
     """
     given = {name: array for name, array in arrays.items() if array is not None}
     described = [{"name": n, "dtype": a.dtype.str, "shape": list(a.shape)} for n, a in given.items()]
-    header = json.dumps({"number": number, "stamp_ns": stamp_ns, "serial": serial, "arrays": described}).encode()
+    tree = {"number": number, "stamp_ns": stamp_ns, "serial": serial, "arrays": described}
+    header = json.dumps(tree, default=int).encode()  # numbers may be NumPy's
     payload = b"".join(a.tobytes() for a in given.values())
     return PREFIX.pack(MAGIC, len(header), len(payload)) + header + payload
 

@@ -20,6 +20,7 @@ from sensors_io.recording.journal import JournalEntry, JournalError, read_journa
 from sensors_io.schema import FRAME_ARRAYS, ContactKey, Flag, Sequence
 
 _GAP_PERIODS = 1.5  # between two frames: one is missing
+_GAP_STEPS = 3.0  # of the usual size, where the period is unknown
 _SILENT_S = 1.0  # before the first frame or after the last of a contact: a device is taken as lost sooner
 _INT64 = np.iinfo(np.int64)
 _MADE_HERE = ("frames", "host_time_ns", "device_time_ns", "force_time_ns", "target_force_n", "phase", "flags")
@@ -264,13 +265,17 @@ class _Force:
 
 
 def _gaps(time_ns: np.ndarray, index: Seq[int | None], period_s: float | None) -> np.ndarray:
-    """Frames at which the counter does not go on by one, or, without a counter, that come too late for the period."""
+    """Frames at which the counter does not go on by one, or, without a counter, that come too late for the period.
+
+    Where that is unknown it is the median step, after which times may be uneven.
+    """
     counter = [i for i in index if i is not None]
     if len(counter) == len(index):
         return np.diff(np.array(counter, np.int64), prepend=counter[0] - 1) != 1
+    steps = np.diff(time_ns, prepend=time_ns[0])
     if period_s is None:
-        return np.zeros(len(time_ns), bool)
-    return np.diff(time_ns, prepend=time_ns[0]) > _GAP_PERIODS * period_s * NS_PER_S
+        return steps > _GAP_STEPS * np.median(steps[1:] if len(steps) > 1 else steps)
+    return steps > _GAP_PERIODS * period_s * NS_PER_S
 
 
 def _phases(entries: Seq[JournalEntry], time_ns: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from sensors_io.devices.base import Sample
+from sensors_io.devices.base import Identity, Sample
 from sensors_io.recording.assemble import assemble
 from sensors_io.recording.journal import JournalError, JournalWriter
 from sensors_io.recording.session import record_session
@@ -148,6 +148,23 @@ def test_a_sensor_that_is_silent_at_either_end_of_a_contact_is_flagged_and_count
     assert [s > 1 for s in made.camera["recording"]["silent_s"]] == silent
     gaps = np.flatnonzero(made.flags & np.uint32(Flag.TIME_GAP))
     assert gaps.tolist() == [range(len(made))[n] for n in marked]
+
+
+def test_a_pause_of_a_sensor_whose_rate_is_unknown_is_flagged(tmp_path):
+    class Uncounted(Partly):
+        """Its times are uneven, as those of a network."""
+
+        identity = property(lambda self: Identity(sensor="digit"))
+
+        def drain(self):
+            late_ns = (7 * self.count % 10) * MS
+            return [dataclasses.replace(s, index=None, host_time_ns=s.host_time_ns + late_ns) for s in super().drain()]
+
+    hand = Hand()
+    cameras = [Camera(hand), Uncounted(hand, lambda n: not 10 < n <= 16)]
+    record_session(tmp_path, FREE, cameras, None, show=hand.show)
+    made = RecordStore(tmp_path).contact(0)["digit"]
+    assert np.flatnonzero(made.flags).tolist() == [np.argmax(np.diff(made.host_time_ns)) + 1]
 
 
 def test_old_frames_of_a_camera_do_not_make_the_others_silent(tmp_path):
