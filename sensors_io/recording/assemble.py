@@ -265,9 +265,9 @@ class _Force:
 
 
 def _gaps(time_ns: np.ndarray, index: Seq[int | None], period_s: float | None) -> np.ndarray:
-    """Frames at which the counter does not go on by one, or, without a counter, that come too late for the period.
+    """Frames at which the counter does not go on by one, or, without one, that come too late for the period.
 
-    Where that is unknown it is the median step, after which times may be uneven.
+    Where that is unknown, too late is three times the median step, as times may be uneven.
     """
     counter = [i for i in index if i is not None]
     if len(counter) == len(index):
