@@ -145,6 +145,8 @@ class _Shared:
         broken = _mend(arrays)
         incomplete = np.any([force.out_of_range, *broken.values()], axis=0)
         flags |= np.where(incomplete, np.uint32(Flag.INCOMPLETE), np.uint32(0))
+        if "flags" in frames[0].arrays:  # of records that are replayed
+            flags |= np.stack([e.arrays["flags"] for e in frames])
         device = [e.plain["device_time_ns"] for e in frames]
         timed = all(t is not None and _INT64.min <= t <= _INT64.max for t in device)
         pictures = [e.arrays["frame"] for e in frames if "frame" in e.arrays]

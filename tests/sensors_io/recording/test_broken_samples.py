@@ -119,6 +119,18 @@ def test_samples_of_another_shape_are_left_out_and_counted(tmp_path):
     assert np.flatnonzero(made.flags & np.uint32(Flag.TIME_GAP)).tolist() == [19]
 
 
+def test_flags_of_records_that_are_replayed_stay(tmp_path):
+    class Replayed(Skin):
+        def drain(self):
+            flags = np.uint32(Flag.SATURATED if self.count == 10 else 0)
+            return [with_arrays(flags=flags)(sample) for sample in super().drain()]
+
+    hand = Hand()
+    record_session(tmp_path, FREE, [Camera(hand), Replayed(hand)], None, show=hand.show)
+    flags = RecordStore(tmp_path).contact(0)["tac3d"].flags
+    assert (np.flatnonzero(flags).tolist(), flags[10]) == ([10], Flag.SATURATED)
+
+
 class Partly(Camera):
     """A camera that gives its frames for some numbers alone."""
 
