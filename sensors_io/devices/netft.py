@@ -136,7 +136,7 @@ class _RateCheck:
     """
 
     _EVERY_NS = NS_PER_S // 4
-    _LEAST = 4  # datagrams that were waited for: the reader may be held up while it waits
+    _LEAST = 8  # datagrams that were waited for: the reader may be held up while it waits
     _ALLOWED_NS = 20_000_000  # the scheduler's share
     _DRIFT = 1e-3  # of two clocks
 
