@@ -14,8 +14,8 @@ output, so that it is handed to the frames alone and everything else goes to sta
 held: when it ends, whoever reads the frames is gone, and so is the server, however silent its SDK.
 
 An adapter is a generator function of one argument that yields (stamp, number or None, name → array), the stamp by
-`time.monotonic_ns()`, the fields on one grid.  The number
-is the SDK's own count of frames; without one, losses are told by the period and repeats by equal pictures.
+`time.monotonic_ns()`, the fields on one grid.  The number is the SDK's own count of frames; without one, losses are
+told by the period and repeats by equal pictures.
 """
 
 import _thread

@@ -136,6 +136,7 @@ class _Shared:
         time_ns = np.array([e.plain["time_ns"] for e in frames], np.int64)
         own = _own_arrays(frames)
         gaps = _gaps(time_ns, [e.plain["index"] for e in frames], identity["period_s"])
+        gaps |= time_ns < np.maximum.accumulate(time_ns)  # by a wrong stamp
         silent_s = self._silent_s(time_ns, identity["period_s"])
         gaps[0] |= silent_s[0] > 0
         gaps[-1] |= silent_s[1] > 0

@@ -243,6 +243,11 @@ def test_forces_whose_times_overlap_are_kept(tmp_path):
     assert not made.flags.any()
 
 
+def test_times_before_those_of_earlier_frames_are_flagged(tmp_path):
+    made = recorded(tmp_path, lambda s: dataclasses.replace(s, host_time_ns=s.host_time_ns - 5 * 10**8))
+    assert np.flatnonzero(made.flags).tolist() == [19, 20, 21]
+
+
 def test_stamps_past_64_bits_leave_the_device_clock_out(tmp_path):
     assert recorded(tmp_path, lambda s: dataclasses.replace(s, device_time_ns=10**20)).device_time_ns is None
 
