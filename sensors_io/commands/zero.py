@@ -1,5 +1,6 @@
 """`python -m sensors_io zero`."""
 
+import collections
 import dataclasses
 import time
 from typing import Protocol, runtime_checkable
@@ -38,27 +39,36 @@ class Zero(Bench):
 
     def run(self) -> int:
         table = Table("sensor", "force before, N", "force after, N")
+        broken: collections.Counter[str] = collections.Counter()
         for config in (self.device, *self.more):
             with opened(config) as device:
                 name = device.identity.sensor
                 if not isinstance(device, Zeroable):
                     raise DeviceNotFoundError(f"{name} has no zero to take: must be tac3d or netft; leave it out")
-                before = _mean_force(device, self.seconds)
+                before = _mean_force(device, self.seconds, broken)
                 device.take_zero()
-                _mean_force(device, _SETTLE_S)
-                table.add_row(name, _vector(before), _vector(_mean_force(device, self.seconds)))
+                _mean_force(device, _SETTLE_S, broken)
+                table.add_row(name, _vector(before), _vector(_mean_force(device, self.seconds, broken)))
         OUT.print(table)
+        for name, count in broken.items():
+            OUT.print(f"{count} broken samples of {name} were left out", highlight=False)
         return 0
 
 
-def _mean_force(device: Device, seconds: float) -> np.ndarray:
-    """Mean over some time, [3]; at least one sample."""
+def _mean_force(device: Device, seconds: float, broken: collections.Counter[str]) -> np.ndarray:
+    """Mean over some time, [3], of at least one sample; counts broken ones, by the name of the device."""
     forces: list[np.ndarray] = []
+    name = device.identity.sensor
     end_s = time.monotonic() + seconds
     while not forces or time.monotonic() < end_s:
-        sample = device.read(_TIMEOUT_S)
+        try:
+            sample = device.read(_TIMEOUT_S)
+        except DeviceDataError:
+            if time.monotonic() > end_s + _TIMEOUT_S:
+                raise
+            broken[name] += 1
+            continue
         if "force_n" not in sample.arrays:
-            name = device.identity.sensor
             raise DeviceDataError(
                 f"{name} sent a sample without force; let its program send it, and take the zero again"
             )

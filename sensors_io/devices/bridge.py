@@ -27,6 +27,8 @@ from typing import IO, Any, Self
 import cv2
 import numpy as np
 
+from sensors_io.clock import NS_PER_S
+from sensors_io.codec import FIELDS
 from sensors_io.devices import bridge_server
 from sensors_io.devices.base import Identity, Sample, require_pitch
 from sensors_io.devices.errors import DeviceDataError, DeviceLostError, DeviceNotFoundError, DeviceTimeoutError
@@ -40,13 +42,14 @@ _KINDS = "biuf"  # of arrays: booleans, integers, floats; never Python objects
 _LAST_WORDS = 4096  # bytes of the server's standard error that are kept for a message
 _LAST_WORDS_S = 0.5  # that they may come after the end of its answers; its children may live on and hold the pipe
 _PIPE_BYTES = 1 << 20  # the most that Linux gives without privileges: a picture of 640 × 480
+_OLDEST_NS = 60 * NS_PER_S  # of a frame: no pipe holds it for longer
 _RELEASE_S = 3.0  # for the SDK to let its sensor go
 _OURS = ("PYTHONPATH", "PYTHONHOME")  # would make the vendor's Python import what belongs to this one
 
 _MOMENT_UNIT_NMM = {"resultant": 1.0, "resultant_n_cnm": 10.0}
 """Resultants by the name that an adapter gives them: force in N, moment in this unit."""
 
-_FIELDS = ("deformation_mm", "shear_mm", "depth_mm", "valid", "force_n", "moment_nmm")
+_KNOWN = (*FIELDS, "force_n", "moment_nmm")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -121,6 +124,9 @@ def to_schema(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray | None, dict
     picture = rest.pop("frame_bgr", None)
     for name, array in rest.items():
         _require_known(name, array)
+    grids = {name: array.shape[:2] for name, array in rest.items() if name in FIELDS}
+    if len(set(grids.values())) > 1:
+        raise DeviceDataError(f"bridge fields have the grids {grids}: must be on one; correct the adapter")
     resultants = {name: rest.pop(name) for name in _MOMENT_UNIT_NMM if name in rest}
     fields = {name: _float32(a) for name, a in rest.items()}
     for name, resultant in resultants.items():
@@ -148,8 +154,8 @@ def to_schema(arrays: Mapping[str, np.ndarray]) -> tuple[np.ndarray | None, dict
 def _require_known(name: str, array: np.ndarray) -> None:
     if name in _MOMENT_UNIT_NMM:
         return
-    if name not in _FIELDS:
-        known = ", ".join(("frame_bgr", *_MOMENT_UNIT_NMM, *_FIELDS))
+    if name not in _KNOWN:
+        known = ", ".join(("frame_bgr", *_MOMENT_UNIT_NMM, *_KNOWN))
         raise DeviceDataError(f"bridge array is named {name!r}: must be one of {known}; correct the adapter")
     dims = FRAME_ARRAYS[name].dims[1:]
     sizes = [size for size, dim in zip(array.shape, dims, strict=False) if dim in (str(size), "h", "w")]
@@ -234,7 +240,13 @@ class Bridge:
             self._fill(deadline, timeout_s)
         described, arrays = unpack(*frame)
         picture, fields = to_schema(arrays)
-        stamp_ns = min(int(described["stamp_ns"]), time.monotonic_ns())
+        now_ns = time.monotonic_ns()
+        stamp_ns = min(int(described["stamp_ns"]), now_ns)
+        if now_ns - stamp_ns > _OLDEST_NS:
+            raise DeviceDataError(
+                f"bridge frame has stamp_ns {stamp_ns}, {(now_ns - stamp_ns) / NS_PER_S:.0f} s before it came: must be "
+                "time.monotonic_ns() when the SDK returned; correct the adapter"
+            )
         return Sample(host_time_ns=stamp_ns, index=described["number"], frame=picture, arrays=fields)
 
     def _take(self) -> tuple[bytes, bytes] | None:

@@ -13,8 +13,9 @@ shape and unit-bearing name of every array, whose bytes follow one another in th
 output, so that it is handed to the frames alone and everything else goes to standard error.  Standard input is only
 held: when it ends, whoever reads the frames is gone, and so is the server, however silent its SDK.
 
-An adapter is a generator function of one argument that yields (stamp in ns, number or None, name → array).  The number
-is the SDK's own count of frames; without one, losses are told by the period and repeats by equal pictures.
+An adapter is a generator function of one argument that yields (stamp, number or None, name → array), the stamp by
+`time.monotonic_ns()`, the fields on one grid.  The number is the SDK's own count of frames; without one, losses are
+told by the period and repeats by equal pictures.
 """
 
 import _thread
@@ -139,7 +140,8 @@ def pack(number, stamp_ns, serial, arrays):
     """
     given = {name: array for name, array in arrays.items() if array is not None}
     described = [{"name": n, "dtype": a.dtype.str, "shape": list(a.shape)} for n, a in given.items()]
-    header = json.dumps({"number": number, "stamp_ns": stamp_ns, "serial": serial, "arrays": described}).encode()
+    tree = {"number": number, "stamp_ns": stamp_ns, "serial": serial, "arrays": described}
+    header = json.dumps(tree, default=int).encode()  # numbers may be NumPy's
     payload = b"".join(a.tobytes() for a in given.values())
     return PREFIX.pack(MAGIC, len(header), len(payload)) + header + payload
 

@@ -258,6 +258,8 @@ class Intake:
         counts = self._counts
         counts.restarts += step.restarted
         counts.late += step.late
+        if step.restarted or self._away:  # its clock may have begun anew too, though it reads more than before
+            self._clock_map = ClockMap()
         broken, self._broken_since = min(self._broken_since, max(step.missing, 0)), 0
         counts.missing += step.missing - step.late - broken
         if self._away:
@@ -278,19 +280,20 @@ class Intake:
                 self._repeated_ns = None
         if self._period_gaps is None or by_index.duplicate or by_index.late:
             return by_index if sample.index is not None else CounterStep()
-        by_period = self._by_period(self._period_gaps, sample)
+        anew = by_index.restarted and sample.index is not None
+        by_period = self._by_period(self._period_gaps, sample, anew)
         if not by_index.restarted:
             return by_index
-        return dataclasses.replace(by_period, restarted=sample.index is not None)
+        return dataclasses.replace(by_period, restarted=anew)
 
-    def _by_period(self, gaps: PeriodGaps, sample: Sample) -> CounterStep:
+    def _by_period(self, gaps: PeriodGaps, sample: Sample, anew: bool) -> CounterStep:
         """By the stamps, whose steps over a clock that was set, or began anew, are those of the host's."""
         host = sample.host_time_ns
         stamp = host if sample.device_time_ns is None else sample.device_time_ns
         last, self._stamps = self._stamps, (stamp, host)
         if last is not None:
             moved = (stamp - last[0]) - (host - last[1])
-            if stamp < last[0] or abs(moved) > _CLOCK_SET_NS:
+            if anew or stamp < last[0] or abs(moved) > _CLOCK_SET_NS:
                 gaps.shift(moved)
         return gaps.step(stamp)
 

@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import enum
 import math
+import select
 import socket
 import struct
 import time
@@ -130,11 +131,12 @@ def parse_calibration(answer: bytes) -> NetFtScale:
 class _RateCheck:
     """Compares the numbers of records, over the rate they are said to have, with the times of their arrival.
 
-    A record that waited is late, none is early: the least delay in each quarter of a second stays where it was if the
-    rate is right, and drifts if it is not.
+    No record is early: the least delay in each quarter of a second stays where it was if the rate is right, and drifts
+    if it is not.  Records that lie there when the reader comes, for it was held up, tell no delay.
     """
 
     _EVERY_NS = NS_PER_S // 4
+    _LEAST = 8  # datagrams that were waited for: the reader may be held up while it waits
     _ALLOWED_NS = 20_000_000  # the scheduler's share
     _DRIFT = 1e-3  # of two clocks
 
@@ -143,27 +145,37 @@ class _RateCheck:
         self._first_ns: int | None = None
         self._number = self._records = 0  # the last number, and how far it lies behind the first
         self._least: int | None = None
+        self._waited = 0  # datagrams that were waited for since the last judgement
         self._usual: int | None = None  # the least of the first half of a second
         self._until_ns = 0
         self.measured_hz: float | None = None
 
-    def step(self, number: int, arrival_ns: int) -> None:
-        """Take a record into account; `measured_hz` is set once the rate is seen to be wrong."""
+    def step(self, number: int, arrival_ns: int, waited: bool) -> None:
+        """Take a record into account; a wrong rate sets `measured_hz`.
+
+        Args:
+          number: of the record.
+          arrival_ns: on the host's clock.
+          waited: whether it ends a datagram that the reader waited for.
+        """
         if self._first_ns is None:
             self._first_ns, self._number, self._until_ns = arrival_ns, number, arrival_ns + self._EVERY_NS
             return
         self._records += (number - self._number + 2**31) % 2**32 - 2**31  # one may overtake another; numbers run around
         self._number = number
+        if not waited:
+            return
+        self._waited += 1
         elapsed_ns = arrival_ns - self._first_ns
         late_ns = elapsed_ns - round(self._records * NS_PER_S / self._rate_hz)
         self._least = late_ns if self._least is None else min(self._least, late_ns)
-        if arrival_ns < self._until_ns:
+        if arrival_ns < self._until_ns or self._waited < self._LEAST:
             return
         if self._usual is None or elapsed_ns < 3 * self._EVERY_NS:  # the very first record may have waited
             self._usual = self._least if self._usual is None else min(self._usual, self._least)
         if abs(self._least - self._usual) > self._ALLOWED_NS + self._DRIFT * elapsed_ns:
             self.measured_hz = self._records * NS_PER_S / elapsed_ns
-        self._least, self._until_ns = None, arrival_ns + self._EVERY_NS
+        self._least, self._waited, self._until_ns = None, 0, arrival_ns + self._EVERY_NS
 
 
 class NetFt:
@@ -175,7 +187,7 @@ class NetFt:
         self._config = config
         self._socket: socket.socket | None = None
         self._calibration: NetFtScale | None = None
-        self._records: deque[tuple[int, bytes]] = deque()
+        self._records: deque[tuple[int, bool, bytes]] = deque()
         self._rate = _RateCheck(config.rate_hz)
 
     @property
@@ -216,13 +228,13 @@ class NetFt:
         """The next record, see `Device.read`."""
         if not self._records:
             self._receive(timeout_s)
-        stamp_ns, record = self._records.popleft()
+        stamp_ns, waited, record = self._records.popleft()
         number, _, status, *counts = RECORD.unpack(record)
         if status & _STATUS_ERROR and not status & _STATUS_RANGE:
             raise DeviceDataError(f"NetFT record {number} has status {status:#010x}: {_meaning(status)}")
         assert self._calibration is not None
         values = np.array(counts, np.float64)
-        self._check_rate(number, stamp_ns)
+        self._check_rate(number, stamp_ns, waited)
         return Sample(
             host_time_ns=stamp_ns,
             device_time_ns=(
@@ -240,11 +252,11 @@ class NetFt:
         """Make the sensor take its present load as zero; only `force-zero` leaves a trace in the records."""
         self._command(Command.BIAS)
 
-    def _check_rate(self, number: int, stamp_ns: int) -> None:
+    def _check_rate(self, number: int, stamp_ns: int, waited: bool) -> None:
         """Warn once of a wrong rate; from then on a record has the time of its arrival alone."""
         if self._rate.measured_hz is not None:
             return
-        self._rate.step(number, stamp_ns)
+        self._rate.step(number, stamp_ns, waited)
         if self._rate.measured_hz is not None:
             warnings.warn(
                 f"NetFT at {self._config.host} sends about {self._rate.measured_hz:.0f} records a second: rate_hz is "
@@ -259,6 +271,7 @@ class NetFt:
             raise DeviceLostError("NetFT is not open; use it in a with block")
         try:
             self._socket.settimeout(timeout_s)
+            waited = not select.select([self._socket], [], [], 0)[0]
             datagram = self._socket.recv(65_535)
         except TimeoutError as silence:
             raise DeviceTimeoutError(
@@ -277,7 +290,7 @@ class NetFt:
         period_ns = round(NS_PER_S / self._config.rate_hz)
         for k in range(count):  # those of one datagram were taken one period after the other
             record = datagram[k * RECORD.size : (k + 1) * RECORD.size]
-            self._records.append((stamp_ns - (count - 1 - k) * period_ns, record))
+            self._records.append((stamp_ns - (count - 1 - k) * period_ns, waited and k == count - 1, record))
 
     def _ask_calibration(self) -> bytes:
         c = self._config

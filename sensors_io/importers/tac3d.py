@@ -10,7 +10,8 @@ gives image order, x right and y down, without touching a vector.  Pressing is u
 
 All of them are the vendor's estimates.  Moments are about the vendor's origin, on the axis of the sensor; its height
 against the window's centre is not published, and they are kept as they are.  The force per point has no place in a
-record and is left out.  A frame before which the counter `index` skips some or begins anew is flagged `TIME_GAP`.
+record and is left out.  A frame before which the counter `index` skips some or begins anew, or whose time runs back, is
+flagged `TIME_GAP`; in the latter case it has the latest time before it.
 `host_time_ns` is the client's receive time where it was stored, the sensor's send time elsewhere.
 """
 
@@ -20,6 +21,7 @@ import pathlib
 import numpy as np
 
 from sensors_io.arrays import ArraysError, load_arrays
+from sensors_io.codec import LARGEST
 from sensors_io.importers.catalogue import Catalogue, Listed, Taken, bare_catalogue, plain_names, require_files
 from sensors_io.importers.keep import Shares, Skip, UnreadableError
 from sensors_io.importers.pictures import film, whole
@@ -37,6 +39,13 @@ _SHAPES = {
     "index": (),
     "sendTimestamp": (),
 }
+
+_LARGEST = {
+    "3D_Displacements": LARGEST["depth_mm"],
+    "3D_ResultantForce": LARGEST["force_n"],
+    "3D_ResultantMoment": LARGEST["moment_nmm"],
+}
+_NO_VALUES = "holds values that are not finite, or that no sensor measures"
 
 
 class RecordingError(UnreadableError):
@@ -68,26 +77,26 @@ def list_tac3d(source: pathlib.Path, config: Shares) -> Catalogue:
 
 def _read(path: pathlib.Path, key: ContactKey) -> Taken:
     arrays = _load(path)
-    kept = np.all([np.isfinite(array).reshape(len(array), -1).all(1) for array in arrays.values()], axis=0)
-    lost = [
-        Skip(name=f"{path.name}, frame {n}", reason="holds values that are not finite") for n in np.flatnonzero(~kept)
-    ]
+    good = [np.abs(array) <= _LARGEST.get(name, np.finfo(float).max) for name, array in arrays.items()]
+    kept = np.all([array.reshape(len(array), -1).all(1) for array in good], axis=0)
+    lost = [Skip(name=f"{path.name}, frame {n}", reason=_NO_VALUES) for n in np.flatnonzero(~kept)]
     if not kept.any():
-        raise RecordingError("holds no frame of finite values")
+        raise RecordingError(f"every frame {_NO_VALUES}")
     arrays = {name: array[kept] for name, array in arrays.items()}
     index = whole(arrays["index"], "index")
     steps = np.diff(index, prepend=index[0] - 1)
     sent_ns = _ns(arrays["sendTimestamp"])
     host_ns = _ns(arrays["recvTimestamp"]) if "recvTimestamp" in arrays else sent_ns
-    if (np.diff(host_ns) < 0).any():
-        raise RecordingError("has receive times that run backwards")
+    back = np.diff(host_ns, prepend=host_ns[0]) < 0
+    if back.any() and host_ns[-1] <= host_ns[0]:
+        raise RecordingError("has times that run backwards")
     moved = _grid(arrays["3D_Displacements"]).astype(np.float32)
     clock = "receive time" if "recvTimestamp" in arrays else "send time"
     sequence = film(
         key,
         SENSOR,
-        gap=(steps > 1) | (steps < 0),
-        host_time_ns=host_ns,
+        gap=(steps > 1) | (steps < 0) | back,
+        host_time_ns=np.maximum.accumulate(host_ns),
         device_time_ns=sent_ns,
         force_time_ns=sent_ns,
         serial=path.stem.rpartition("_")[2],

@@ -20,6 +20,7 @@ from sensors_io.recording.journal import JournalEntry, JournalError, read_journa
 from sensors_io.schema import FRAME_ARRAYS, ContactKey, Flag, Sequence
 
 _GAP_PERIODS = 1.5  # between two frames: one is missing
+_GAP_STEPS = 3.0  # of the usual size, where the period is unknown
 _SILENT_S = 1.0  # before the first frame or after the last of a contact: a device is taken as lost sooner
 _INT64 = np.iinfo(np.int64)
 _MADE_HERE = ("frames", "host_time_ns", "device_time_ns", "force_time_ns", "target_force_n", "phase", "flags")
@@ -135,6 +136,7 @@ class _Shared:
         time_ns = np.array([e.plain["time_ns"] for e in frames], np.int64)
         own = _own_arrays(frames)
         gaps = _gaps(time_ns, [e.plain["index"] for e in frames], identity["period_s"])
+        gaps |= time_ns < np.maximum.accumulate(time_ns)  # by a wrong stamp
         silent_s = self._silent_s(time_ns, identity["period_s"])
         gaps[0] |= silent_s[0] > 0
         gaps[-1] |= silent_s[1] > 0
@@ -144,6 +146,8 @@ class _Shared:
         broken = _mend(arrays)
         incomplete = np.any([force.out_of_range, *broken.values()], axis=0)
         flags |= np.where(incomplete, np.uint32(Flag.INCOMPLETE), np.uint32(0))
+        if "flags" in frames[0].arrays:  # of records that are replayed
+            flags |= np.stack([e.arrays["flags"] for e in frames])
         device = [e.plain["device_time_ns"] for e in frames]
         timed = all(t is not None and _INT64.min <= t <= _INT64.max for t in device)
         pictures = [e.arrays["frame"] for e in frames if "frame" in e.arrays]
@@ -264,13 +268,17 @@ class _Force:
 
 
 def _gaps(time_ns: np.ndarray, index: Seq[int | None], period_s: float | None) -> np.ndarray:
-    """Frames at which the counter does not go on by one, or, without a counter, that come too late for the period."""
+    """Frames at which the counter does not go on by one, or, without one, that come too late for the period.
+
+    Where that is unknown, too late is three times the median step, as times may be uneven.
+    """
     counter = [i for i in index if i is not None]
     if len(counter) == len(index):
         return np.diff(np.array(counter, np.int64), prepend=counter[0] - 1) != 1
+    steps = np.diff(time_ns, prepend=time_ns[0])
     if period_s is None:
-        return np.zeros(len(time_ns), bool)
-    return np.diff(time_ns, prepend=time_ns[0]) > _GAP_PERIODS * period_s * NS_PER_S
+        return steps > _GAP_STEPS * np.median(steps[1:] if len(steps) > 1 else steps)
+    return steps > _GAP_PERIODS * period_s * NS_PER_S
 
 
 def _phases(entries: Seq[JournalEntry], time_ns: np.ndarray) -> np.ndarray:

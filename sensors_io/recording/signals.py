@@ -20,7 +20,7 @@ class Listener:
     """Turns the samples of a device into one number each: what a touch changes.
 
     Of a picture the mean change against the first one, else the magnitude of the force, else the mean magnitude of the
-    deformation or of the depth.
+    deformation or of the depth.  Samples of another size or with other arrays than most are left out of its signal.
 
     Args:
       feed: an open device.
@@ -28,9 +28,9 @@ class Listener:
 
     def __init__(self, feed: SampleReader):
         self.feed = feed
-        self._first: np.ndarray | None = None
-        self._times: list[int] = []
-        self._values: list[float] = []
+        self._first: dict[_Kind, np.ndarray] = {}
+        self._heard: dict[_Kind, list[tuple[int, float]]] = {}
+        self._last: tuple[int, float] | None = None
 
     @property
     def name(self) -> str:
@@ -40,14 +40,16 @@ class Listener:
     def look(self) -> None:
         """Take in everything that came since the last look; repeated stamps are left out."""
         for sample in self.feed.drain():
-            if not self._times or sample.host_time_ns > self._times[-1]:
-                self._values.append(self._value(sample))
-                self._times.append(sample.host_time_ns)
+            if self._last is None or sample.host_time_ns > self._last[0]:
+                name, array = self._telling(sample)
+                kind = name, array.shape
+                self._last = sample.host_time_ns, _number(name, array, self._first.setdefault(kind, array))
+                self._heard.setdefault(kind, []).append(self._last)
 
     @property
     def newest(self) -> float:
         """The last number, 0 before the first."""
-        return self._values[-1] if self._values else 0.0
+        return 0.0 if self._last is None else self._last[1]
 
     def signal(self) -> Signal:
         """All of them.
@@ -55,22 +57,32 @@ class Listener:
         Raises:
           OffsetsError: hardly any came.
         """
-        if len(self._times) < _LEAST_SAMPLES:
+        heard = max(self._heard.values(), key=len, default=[])
+        if len(heard) < _LEAST_SAMPLES:
             raise OffsetsError(
-                f"{self.name} gave {len(self._times)} samples: must be ≥ {_LEAST_SAMPLES}; look whether it is connected"
+                f"{self.name} gave {len(heard)} samples: must be ≥ {_LEAST_SAMPLES}; look whether it is connected"
             )
-        return Signal(time_ns=np.array(self._times, np.int64), value=np.array(self._values))
+        times, values = zip(*heard, strict=True)
+        return Signal(time_ns=np.array(times, np.int64), value=np.array(values))
 
-    def _value(self, sample: Sample) -> float:
+    def _telling(self, sample: Sample) -> tuple[str, np.ndarray]:
+        """Name and array of what tells a touch."""
         if sample.frame is not None:
-            small = sample.frame[::_STRIDE, ::_STRIDE].astype(np.float32)
-            self._first = small if self._first is None else self._first
-            return float(np.abs(small - self._first).mean())
+            return "frame", sample.frame[::_STRIDE, ::_STRIDE].astype(np.float32)
         for name in ("force_n", "deformation_mm", "depth_mm"):
             if name in sample.arrays:
-                array = np.nan_to_num(np.asarray(sample.arrays[name], np.float64))
-                return float(np.linalg.norm(array, axis=-1).mean() if name != "depth_mm" else np.abs(array).mean())
+                return name, np.nan_to_num(np.asarray(sample.arrays[name], np.float64))
         raise OffsetsError(f"{self.name} gives neither pictures nor forces nor fields: nothing tells a touch")
+
+
+_Kind = tuple[str, tuple[int, ...]]
+"""Name and shape of what tells a touch."""
+
+
+def _number(name: str, array: np.ndarray, first: np.ndarray) -> float:
+    if name == "frame":
+        return float(np.abs(array - first).mean())
+    return float(np.linalg.norm(array, axis=-1).mean() if name != "depth_mm" else np.abs(array).mean())
 
 
 _LEAST_SAMPLES = 16

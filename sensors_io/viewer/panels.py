@@ -63,23 +63,26 @@ def outlined(picture: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 def coloured(field: np.ndarray, top: float) -> np.ndarray:
     """A field [h, w] from 0 to `top` in the colours of Viridis; where it is not finite, black."""
-    share = np.clip(np.nan_to_num(field.astype(np.float32)) / max(top, 1e-9), 0, 1)
+    share = np.clip(np.nan_to_num(field) / max(top, 1e-9), 0, 1)
     picture = cv2.applyColorMap(np.rint(255 * share).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
     picture[~np.isfinite(field)] = 0
     return _enlarged(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
 
 
 def arrows(field_mm: np.ndarray, top_mm: float = _SHIFT_TOP_MM) -> np.ndarray:
-    """A vector field [h, w, 2] as arrows over its magnitude, from 0 to `top_mm`."""
+    """A vector field [h, w, 2] as arrows over its magnitude, from 0 to `top_mm`; none is longer than the picture."""
+    field_mm = field_mm.astype(np.float64)
     picture = coloured(np.linalg.norm(field_mm, axis=-1), top_mm)
     height, width = field_mm.shape[:2]
     step = max(1, max(height, width) // _ARROWS)
     rows, columns = np.mgrid[step // 2 : height : step, step // 2 : width : step]
     scale = np.array([picture.shape[1] / width, picture.shape[0] / height])
     start = (np.stack([columns, rows], -1) + 0.5) * scale
-    shift = _ARROW_GAIN * picture.shape[0] / _WINDOW_MM * np.nan_to_num(field_mm[rows, columns])
-    seen = np.hypot(shift[..., 0], shift[..., 1]) >= _LEAST_ARROW_PX
-    strokes = _strokes(start[seen], shift[seen])
+    drawn = field_mm[rows, columns]
+    shift = _ARROW_GAIN * picture.shape[0] / _WINDOW_MM * np.where(np.isfinite(drawn), drawn, 0)
+    length, longest = np.hypot(shift[..., 0], shift[..., 1]), sum(picture.shape[:2])  # OpenCV draws 10⁹ px for minutes
+    seen = length >= _LEAST_ARROW_PX
+    strokes = _strokes(start[seen], shift[seen] * np.minimum(1, longest / length[seen])[:, None])
     for colour, thickness in ((_HALO, 3), (_INK, 1)):  # white in a dark halo is seen on every colour
         cv2.polylines(picture, strokes, False, colour, thickness, cv2.LINE_AA, _SUBPIXEL_BITS)
     return picture

@@ -4,9 +4,11 @@ import contextlib
 import time
 
 import numpy as np
+import pytest
 
 from sensors_io import __main__ as cli
 from sensors_io.devices.base import Identity, Sample
+from sensors_io.devices.errors import DeviceDataError
 from sensors_io.devices.tac3d import Tac3dConfig
 
 
@@ -36,6 +38,24 @@ def test_a_drifted_sensor_reads_zero_afterwards(monkeypatch, capsys):
     rows = [line for line in capsys.readouterr().out.splitlines() if "tac3d" in line]
     assert len(rows) == 2
     assert all("+0.000 +0.000 -0.400" in row and row.count("+0.000 +0.000 +0.000") == 1 for row in rows)
+
+
+@pytest.mark.parametrize(("broken", "status"), [(7, 0), (1_000_000, 1)])
+def test_broken_messages_are_left_out_unless_all_are_broken(monkeypatch, capsys, broken, status):
+    class Noisy(Drifted):
+        left = broken
+
+        def read(self, timeout_s):
+            if self.left:
+                Noisy.left -= 1
+                raise DeviceDataError("2 bytes: its header alone has 8")
+            return super().read(timeout_s)
+
+    monkeypatch.setattr(Tac3dConfig, "open", lambda self: Noisy())
+    monkeypatch.setattr("sensors_io.commands.zero._TIMEOUT_S", 0.1)
+    assert cli.main(["zero", "--seconds", "0.05", "tac3d"]) == status
+    said = capsys.readouterr()
+    assert "2 bytes" in said.err if status else "7 broken samples of tac3d were left out" in said.out
 
 
 def test_a_message_without_force_is_one_line(monkeypatch, capsys):

@@ -30,6 +30,8 @@ def test_a_failing_sdk_says_its_last_words(monkeypatch, request):
         pass
     with pytest.raises(DeviceNotFoundError, match=r"gave no frame: .* of type object"), config("objects").open():
         pass
+    with pytest.raises(DeviceNotFoundError, match=r"s before it came: must be time.monotonic_ns"), config("µs").open():
+        pass
     with pytest.raises(DeviceNotFoundError, match="does not start"), bridge.BridgeConfig(python="/nowhere").open():
         pass
     refused(DeviceLostError, "not open", lambda: config("3").open().read(0.1))
@@ -63,6 +65,11 @@ def test_damaged_frames_are_refused():
 )
 def test_arrays_that_no_record_holds_are_refused(name, shape):
     refused(DeviceDataError, f"bridge .*{name}.*correct", bridge.to_schema, {name: np.zeros(shape, np.uint8)})
+
+
+def test_fields_of_two_grids_are_refused():
+    fields = {"depth_mm": np.zeros((4, 6)), "shear_mm": np.zeros((3, 6, 2))}
+    refused(DeviceDataError, "must be on one; correct", bridge.to_schema, fields)
 
 
 XENSESDK = '''

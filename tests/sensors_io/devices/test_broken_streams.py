@@ -142,6 +142,25 @@ def test_a_record_that_another_overtook_or_that_waited_is_no_wrong_rate(waited):
     assert None not in stamps
 
 
+def test_a_reader_that_was_held_up_does_not_call_the_rate_wrong():
+    class OnTime(list):
+        """Records 1000 times a second."""
+
+        def __iter__(self):
+            began = time.monotonic()
+            for k in super().__iter__():
+                time.sleep(max(0.0, began + k / 1000 - time.monotonic()))
+                yield record(k, *[0] * 6)
+
+    with sensor(OnTime(range(2200))) as (config, _), config.open() as device:
+        stamps = []
+        for k in range(2200):
+            if 600 <= k < 1800:  # it is half a second late, and catches up within a second
+                time.sleep(0.5 if k == 600 else 0.0004)
+            stamps.append(device.read(5.0).device_time_ns)
+    assert None not in stamps
+
+
 def test_a_wrong_rate_of_a_force_sensor_warns_and_leaves_its_stamps_out():
     class Slow(list):
         """Records every 10 ms: 100 a second."""

@@ -127,16 +127,20 @@ def test_a_silent_device_is_taken_as_lost():
     assert (counts.timeouts, counts.disconnects, counts.reconnects) == (3, 1, 1)
 
 
-@pytest.mark.parametrize("stamps", [(None, None, None, None), (40, 50, 0, 10)], ids=["host's", "device's"])
+@pytest.mark.parametrize(
+    "stamps", [(None, None, None, None), (40, 50, 0, 10), (40, 50, 60, 70)], ids=["host's", "anew", "anew, later"]
+)
 def test_a_counter_that_restarts_on_reconnecting_leaves_the_loss_to_the_clock(stamps):
-    """That of the host where the device's began anew too."""
+    """That of the host where the device's began anew too, even if it reads more than before."""
     script = [
         sample(index, time_ms, device_time_ns=stamp if stamp is None else stamp * MS)
         for (index, time_ms), stamp in zip([(4, 40), (5, 50), (0, 110), (1, 120)], stamps, strict=True)
     ]
     script.insert(2, DeviceLostError("x"))
-    counts = pumped(Scripted(script, period_s=0.01)).counts
+    intake = pumped(Scripted(script, period_s=0.01))
+    counts = intake.counts
     assert (counts.restarts, counts.missing, counts.missing_away) == (1, 5, 5)
+    assert [s.host_time_ns // MS for s in drain(intake)] == [40, 50, 110, 120]
 
 
 @pytest.mark.parametrize("set_by_s", [-3600, 3600])

@@ -80,7 +80,8 @@ def test_gaps_of_the_counter_are_flagged_and_counted(tmp_path):
         ({"3D_Positions": np.zeros((3, 400, 2))}, r"3D_Positions has shape \(3, 400, 2\): must be \(3, 400, 3\)"),
         ({"3D_Positions": recording()["3D_Positions"][:, ::-1]}, "points in another order"),
         ({"recvTimestamp": np.arange(2.0)}, r"recvTimestamp has shape \(2,\): must be \(3,\)"),
-        ({"3D_ResultantForce": np.full((3, 1, 3), np.inf)}, "no frame of finite values"),
+        ({"3D_ResultantForce": np.full((3, 1, 3), np.inf)}, "every frame holds values that are not finite"),
+        ({"recvTimestamp": np.array([0.5, 0.4, 0.3])}, "has times that run backwards"),
         ({"3D_ResultantMoment": np.full((3, 1, 3), "7")}, "3D_ResultantMoment holds <U1: must hold numbers"),
         ({"index": 7}, r"index has shape \(\): must be \(N,\)"),
         ({"sendTimestamp": 1e12 + np.arange(3)}, "times in ns: reach 1e\\+21, which 64 bits cannot hold"),
@@ -94,17 +95,19 @@ def test_receive_times_are_host_times_where_they_are_stored(tmp_path):
     write(tmp_path / "in", "a_S1")
     write(tmp_path / "in", "b_S2", recvTimestamp=np.array([0.04, 0.07, 0.52]))
     write(tmp_path / "in", "c_S3", recvTimestamp=np.array([0.04, 0.03, 0.52]))
-    report, store = read(tmp_path / "in", tmp_path / "out")
-    sent, received = (store.contact(i)["tac3d"] for i in range(2))
+    _, store = read(tmp_path / "in", tmp_path / "out")
+    sent, received, back = (store.contact(i)["tac3d"] for i in range(3))
     np.testing.assert_array_equal(sent.host_time_ns, sent.device_time_ns)
     assert received.host_time_ns.tolist() == [40_000_000, 70_000_000, 520_000_000]
     np.testing.assert_array_equal(received.force_time_ns, received.device_time_ns)
-    assert report.skipped[0].reason == "has receive times that run backwards"
+    assert back.host_time_ns.tolist() == [40_000_000, 40_000_000, 520_000_000]
+    assert back.flags.tolist() == [0, int(Flag.TIME_GAP), int(Flag.TIME_GAP)]  # the last, by its counter
 
 
-def test_a_frame_that_is_not_finite_is_left_out(tmp_path):
+@pytest.mark.parametrize("value", [np.nan, 1e7, 1e300])
+def test_a_frame_of_values_that_no_sensor_measures_is_left_out(tmp_path, value):
     arrays = recording()
-    arrays["3D_ResultantForce"][1, 0, 2] = np.nan
+    arrays["3D_ResultantForce"][1, 0, 2] = value
     received = np.array([0.1, 0.2, np.nan])
     report, store = read(write(tmp_path / "in", **arrays, recvTimestamp=received), tmp_path / "more")
     assert [skip.name[-7:] for skip in report.skipped] == ["frame 1", "frame 2"]

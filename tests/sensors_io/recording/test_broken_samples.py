@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from sensors_io.devices.base import Sample
+from sensors_io.devices.base import Identity, Sample
 from sensors_io.recording.assemble import assemble
 from sensors_io.recording.journal import JournalError, JournalWriter
 from sensors_io.recording.session import record_session
@@ -119,6 +119,18 @@ def test_samples_of_another_shape_are_left_out_and_counted(tmp_path):
     assert np.flatnonzero(made.flags & np.uint32(Flag.TIME_GAP)).tolist() == [19]
 
 
+def test_flags_of_records_that_are_replayed_stay(tmp_path):
+    class Replayed(Skin):
+        def drain(self):
+            flags = np.uint32(Flag.SATURATED if self.count == 10 else 0)
+            return [with_arrays(flags=flags)(sample) for sample in super().drain()]
+
+    hand = Hand()
+    record_session(tmp_path, FREE, [Camera(hand), Replayed(hand)], None, show=hand.show)
+    flags = RecordStore(tmp_path).contact(0)["tac3d"].flags
+    assert (np.flatnonzero(flags).tolist(), flags[10]) == ([10], Flag.SATURATED)
+
+
 class Partly(Camera):
     """A camera that gives its frames for some numbers alone."""
 
@@ -148,6 +160,23 @@ def test_a_sensor_that_is_silent_at_either_end_of_a_contact_is_flagged_and_count
     assert [s > 1 for s in made.camera["recording"]["silent_s"]] == silent
     gaps = np.flatnonzero(made.flags & np.uint32(Flag.TIME_GAP))
     assert gaps.tolist() == [range(len(made))[n] for n in marked]
+
+
+def test_a_pause_of_a_sensor_whose_rate_is_unknown_is_flagged(tmp_path):
+    class Uncounted(Partly):
+        """Its times are uneven, as those of a network."""
+
+        identity = property(lambda self: Identity(sensor="digit"))
+
+        def drain(self):
+            late_ns = (7 * self.count % 10) * MS
+            return [dataclasses.replace(s, index=None, host_time_ns=s.host_time_ns + late_ns) for s in super().drain()]
+
+    hand = Hand()
+    cameras = [Camera(hand), Uncounted(hand, lambda n: not 10 < n <= 16)]
+    record_session(tmp_path, FREE, cameras, None, show=hand.show)
+    made = RecordStore(tmp_path).contact(0)["digit"]
+    assert np.flatnonzero(made.flags).tolist() == [np.argmax(np.diff(made.host_time_ns)) + 1]
 
 
 def test_old_frames_of_a_camera_do_not_make_the_others_silent(tmp_path):
@@ -212,6 +241,11 @@ def test_forces_whose_times_overlap_are_kept(tmp_path):
     made = RecordStore(tmp_path).contact(0)["gelsight_mini"]
     np.testing.assert_array_equal(made.force_n, np.zeros((len(made), 3)))
     assert not made.flags.any()
+
+
+def test_times_before_those_of_earlier_frames_are_flagged(tmp_path):
+    made = recorded(tmp_path, lambda s: dataclasses.replace(s, host_time_ns=s.host_time_ns - 5 * 10**8))
+    assert np.flatnonzero(made.flags).tolist() == [19, 20, 21]
 
 
 def test_stamps_past_64_bits_leave_the_device_clock_out(tmp_path):

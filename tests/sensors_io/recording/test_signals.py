@@ -73,3 +73,14 @@ def test_a_sensor_that_felt_nothing_is_named():
     refused(OffsetsError, said, measure_offsets, heard(Feed("netft", 500)), late, "netft", "taps")
     refused(OffsetsError, "tac3d gave 0 samples", heard, of())
     refused(OffsetsError, "nothing tells a touch", heard, of(Sample(host_time_ns=0)))
+
+
+def test_samples_unlike_most_are_left_out():
+    """One of another size, and one without a picture, in place of two of the camera's."""
+    feed = Feed("digit", 60, picture=True)
+    for n, odd in ((0, {"frame": np.zeros((16, 8, 3), np.uint8)}), (40, {"arrays": {"force_n": np.full(3, 9.0)}})):
+        feed.samples[n] = Sample(host_time_ns=feed.samples[n].host_time_ns, **odd)
+    signal = heard(feed)
+    assert len(signal.time_ns) == 538
+    assert signal.value[0] == 0
+    assert signal.value.max() < 110

@@ -6,6 +6,7 @@ import json
 import socket
 import struct
 import threading
+import time
 import urllib.error
 import urllib.parse
 import urllib.request
@@ -82,6 +83,10 @@ def test_fields_are_coloured_and_holes_are_black():
     assert still.shape[:2] == (320, 240)
     assert np.ptp(still.reshape(-1, 3), axis=0).max() == 0  # no arrow where nothing moves
     assert (arrows(np.full((40, 30, 2), 0.2)) == 255).all(-1).any()
+    began = time.process_time()
+    assert (arrows(np.full((20, 20, 2), [np.inf, -1e30], np.float32)) == 0).any()
+    assert (arrows(np.full((20, 20, 2), [3e38, -1e30], np.float32)) == 255).all(-1).any()
+    assert time.process_time() - began < 5  # once minutes
 
 
 def test_a_picture_of_known_width_has_a_scale_and_a_field_its_colours():
