@@ -128,7 +128,7 @@ def start_state(params: Params, optimizer: optax.GradientTransformation, key: Ar
         params=own,
         opt_state=optimizer.init(own),
         step=jnp.zeros((), jnp.int32),
-        key=key,
+        key=jax.random.clone(key),
         reference=copy() if config.algorithm.reference_every is not None else None,
         behind=tuple(copy() for _ in range(config.algorithm.stale)),
     )

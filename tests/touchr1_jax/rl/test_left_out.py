@@ -169,6 +169,13 @@ def test_dynamic_sampling_logs_what_it_passed_over():
     assert chosen["reward"] != chosen["drawn_reward"]
 
 
+def test_a_step_that_takes_its_state_leaves_the_callers_key():
+    key = jax.random.key(0)
+    state = start_state(PARAMS, OPTIMIZER, key, CONFIG)
+    jax.jit(lambda state: state, donate_argnums=0)(state)
+    jax.random.split(key)
+
+
 def test_trained_parameters_have_32_bits():
     """An update of 1e-6 is less than bfloat16 rounds a weight of .02."""
     narrow = {"decoder": {"kernel": jnp.full(3, 0.02, jnp.bfloat16)}}
