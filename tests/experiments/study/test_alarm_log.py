@@ -15,6 +15,9 @@ from touchr1_jax.rl.alarms import WINDOW
 from touchr1_jax.rl.scoring import NONFINITE_IN
 from touchr1_jax.training.loop import SKIPPED
 
+STAGE, STEPS = "grpo/chosen/0", WINDOW + 6
+
+
 def told(directory: Path, metrics: dict[str, float]) -> str:
     """What a stage prints after one step."""
     console = Console(file=io.StringIO(), width=300)
@@ -32,9 +35,6 @@ def test_a_step_that_lost_its_update_raises_the_alarms_of_its_other_numbers(tmp_
 
 def test_a_reward_that_is_rarely_not_finite_is_not_said_to_be_always_finite(tmp_path):
     assert "0.2 % of the groups" in told(tmp_path, {f"{NONFINITE_IN}spread": 1 / 512})
-
-
-STAGE, STEPS = "grpo/chosen/0", WINDOW + 6
 
 
 @pytest.mark.parametrize("stopped_at", [0, 3, WINDOW + 2, STEPS])

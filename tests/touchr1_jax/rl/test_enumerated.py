@@ -69,9 +69,7 @@ def test_a_trace_without_conclusion_keeps_its_sampled_reward():
 
 
 def test_a_group_that_earns_nothing_has_no_advantage_without_an_epsilon_either():
-    found = exact_terms(
-        Norm.STD, jnp.log(PROBABILITY), 0 * REWARD, jnp.ones(2, bool), jnp.zeros(2), epsilon=0.0
-    )
+    found = exact_terms(Norm.STD, jnp.log(PROBABILITY), 0 * REWARD, jnp.ones(2, bool), jnp.zeros(2), epsilon=0.0)
     np.testing.assert_array_equal([*found.advantage, *found.objective], 0)
 
 

@@ -162,8 +162,8 @@ def test_dynamic_sampling_logs_what_it_passed_over():
         return jax.device_get(step(state, tiny.question_batch(1, P), FROZEN))[1]
 
     chosen, whole = metrics_of(prompts=2), metrics_of(prompts=P)
-    found = "touch_share", "reward", "accuracy", "degenerate_share", "all_right_share", "nonfinite_share", "idle_share", "gamed_share"
-    for name in found:
+    of_answers = "reward", "accuracy", "degenerate_share", "all_right_share", "idle_share", "gamed_share"
+    for name in (*of_answers, "nonfinite_share", "touch_share"):
         np.testing.assert_allclose(chosen[f"drawn_{name}"], whole[name], rtol=1e-6)
     assert chosen["degenerate_share"] < chosen["drawn_degenerate_share"]
     assert chosen["reward"] != chosen["drawn_reward"]
