@@ -231,7 +231,7 @@ class GRPOEngine:
         reference = frozen.reference if state.reference is None else state.reference
         passed = functools.partial(log_probs, self.fns, self.config, batch=group.batch, rollout=group.rollout)
         lagged, in_reward = not ratio_to_learner(self.config.algorithm), self.config.algorithm.kl_in_reward
-        rounds_otherwise = self.config.bfloat16 or group.batch.rollout is not None
+        rounds_otherwise = self.fns.cache_dtype != jnp.float32 or group.batch.rollout is not None
         own = passed(sampler) if lagged or (in_reward and rounds_otherwise) else group.rollout.log_prob
         if in_reward:
             group, left_out = self.penalised(group, own - passed(reference))
