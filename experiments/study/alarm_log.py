@@ -23,7 +23,7 @@ def alarm_log(
 
     def alarms_of(metrics: dict[str, float], t: int, *, aloud: bool) -> dict[str, float]:
         left_out = SKIPPED in metrics  # then the numbers that are not finite are missing
-        alarms = monitor.update({} if left_out else metrics, left_out=left_out)
+        alarms = monitor.update(metrics, left_out=left_out)
         notes = {f"{alarm.code} {alarm.meaning}": str(alarm) for alarm in alarms}
         if left_out:
             what = "the update is left out, for its gradient or the policy after it is not finite"
@@ -31,7 +31,7 @@ def alarm_log(
         for name, share in metrics.items():
             if name.startswith(NONFINITE_IN) and share > 0:
                 reward = name.removeprefix(NONFINITE_IN)
-                what = f"reward {reward!r} is not finite in {share:.0%} of the groups, which are left out"
+                what = f"reward {reward!r} is not finite in {100 * share:.2g} % of the groups, which are left out"
                 notes[name] = f"{what}; the report counts all of them"
         for name, note in notes.items():
             if aloud and name not in printed:

@@ -177,14 +177,12 @@ class ActiveEngine(GRPOEngine):
         return touch, jnp.zeros(len(touch), jnp.int32)
 
     def answered(self, group: Group) -> dict[str, Array]:
-        """None: these answers are a conclusion alone."""
-        del group
-        return {}
+        """Share of prompts in which anything was observed; these answers are a conclusion alone."""
+        return {"touch_share": jnp.mean(cast(Explored, group.batch.features).stream_mask)}
 
     def metrics(self, group: Group, learn: Experience) -> dict[str, Array]:
-        """Size of the advantages, and share of prompts in which anything was observed."""
-        seen = cast(Explored, group.batch.features)
-        return advantage_metrics(group.reward, learn.advantage) | {"touch_share": jnp.mean(seen.stream_mask)}
+        """Size of the advantages."""
+        return advantage_metrics(group.reward, learn.advantage)
 
 
 def exploration_metrics(found: Trajectories, batch: ActiveBatch, kinds: tuple[str, ...]) -> dict[str, Array]:

@@ -150,8 +150,8 @@ def segment_advantages(
     left, rest, each = reward, dict(terms), []
     for s in range(3):
         each.append(advantages(algorithm, left, rest, finite))
-        for name in [name for name in rest if settled.get(name, 2) == s]:
-            left = left - rest.pop(name)
+        rest = {name: term for name, term in rest.items() if settled.get(name, 2) != s}
+        left = sum(rest.values(), start=jnp.zeros_like(reward))  # what is subtracted from a sum leaves its rounding
     return jnp.take_along_axis(jnp.stack(each, -1), segment, -1)
 
 

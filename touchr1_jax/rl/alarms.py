@@ -169,13 +169,12 @@ def forgotten_stream(now: Metrics, start: Metrics) -> float | None:
 def touched_share(now: Metrics, start: Metrics) -> float | None:
     """F10: share of the prompts that have any touch."""
     del start
-    return now.get("touch_share")
+    return of_candidates(now, "touch_share") if "touch_share" in now else None
 
 
 def untouched_share(now: Metrics, start: Metrics) -> float | None:
     """F10: share of the prompts without touch, where others have some."""
-    del start
-    return 1 - now["touch_share"] if now.get("touch_share", 0.0) > 0 else None
+    return 1 - share if (share := touched_share(now, start)) else None
 
 
 def left_out_groups(now: Metrics, start: Metrics) -> float | None:

@@ -13,7 +13,7 @@ so that MEAN follows ∇ log Ē.  Any other word in the place of a level earns n
 keeps its sampled reward as E_i, and all of its tokens are trace.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple, assert_never
 
 import jax
@@ -90,7 +90,8 @@ def level_rewards(
 
     reward = jnp.moveaxis(jax.lax.map(with_level, (jnp.arange(ids.shape[1]), ids.T)), 0, -1)
     known = finite & squares_fit(reward)
-    found = LevelRewards(ids=ids, at=at, reward=jnp.where(known[:, None, None], reward, 0.0), sampled=sampled)
+    kept = jnp.where(known[:, None], sampled, 0.0)
+    found = LevelRewards(ids=ids, at=at, reward=jnp.where(known[:, None, None], reward, 0.0), sampled=kept)
     return found, known, {f"{NONFINITE_IN}levels": jnp.mean(finite & ~known)}
 
 
@@ -138,11 +139,18 @@ def _norm(
             other_words = (1 - jnp.sum(p, -1)) * mean**2
             spread = jnp.sum(p * (reward - mean[..., None]) ** 2, -1) + jnp.maximum(other_words, 0.0)
             spread = jnp.where(states, spread, (sampled - mean) ** 2)
-            return jnp.sqrt(jnp.mean(spread, -1, keepdims=True)) + epsilon
+            n = jnp.sqrt(jnp.mean(spread, -1, keepdims=True)) + epsilon
+            return jnp.where(n > 0, n, 1.0)  # at ε = 0, where every level earns 0
         case Norm.MEAN:
             return jnp.maximum(mean, MEAN_FLOOR)
         case _:
             assert_never(norm)
+
+
+def of_kept(parts: Mapping[str, Array], finite: Bool[Array, "P"]) -> dict[str, Array]:
+    """Parts of a loss with the mean E_i over the groups that stay alone; E_i of the others is 0."""
+    share = jnp.maximum(jnp.mean(finite), 1 / len(finite))
+    return {name: x / share if name == "expected_reward" else x for name, x in parts.items()}
 
 
 def conclude_exactly(

@@ -38,7 +38,7 @@ from touchr1_jax.rl.advantages import (
 )
 from touchr1_jax.rl.config import Average, GRPOConfig, TactileUse, at_precision, ratio_to_learner
 from touchr1_jax.rl.counterfactual import mask_one_stream
-from touchr1_jax.rl.enumerated import LevelRewards, all_equal, level_rewards
+from touchr1_jax.rl.enumerated import LevelRewards, all_equal, level_rewards, of_kept
 from touchr1_jax.rl.gradient import Experience, log_probs
 from touchr1_jax.rl.losses import check_centering, over_tokens
 from touchr1_jax.rl.metrics import (
@@ -128,7 +128,7 @@ def start_state(params: Params, optimizer: optax.GradientTransformation, key: Ar
         params=own,
         opt_state=optimizer.init(own),
         step=jnp.zeros((), jnp.int32),
-        key=key,
+        key=jax.random.clone(key),
         reference=copy() if config.algorithm.reference_every is not None else None,
         behind=tuple(copy() for _ in range(config.algorithm.stale)),
     )
@@ -231,7 +231,7 @@ class GRPOEngine:
         reference = frozen.reference if state.reference is None else state.reference
         passed = functools.partial(log_probs, self.fns, self.config, batch=group.batch, rollout=group.rollout)
         lagged, in_reward = not ratio_to_learner(self.config.algorithm), self.config.algorithm.kl_in_reward
-        rounds_otherwise = self.config.bfloat16 or group.batch.rollout is not None
+        rounds_otherwise = self.fns.cache_dtype != jnp.float32 or group.batch.rollout is not None
         own = passed(sampler) if lagged or (in_reward and rounds_otherwise) else group.rollout.log_prob
         if in_reward:
             group, left_out = self.penalised(group, own - passed(reference))
@@ -241,6 +241,7 @@ class GRPOEngine:
         params, opt_state, parts = update_policy(
             self.fns, self.optimizer, self.config, state.params, state.opt_state, reference, learn
         )
+        parts = of_kept(parts, group.finite)
         metrics |= parts | self.group_metrics(group) | self.answered(group) | self.metrics(group, learn)
         step, behind = state.step + 1, (*state.behind, state.params)[1:]
         after = dataclasses.replace(state, params=params, opt_state=opt_state, step=step, behind=behind)
@@ -378,14 +379,14 @@ class GRPOEngine:
         }
 
     def answered(self, group: Group) -> dict[str, Array]:
-        """Metrics of the answers, also of all candidates: no group whose answers are all alike is selected."""
-        return answer_metrics(group.parsed, group.batch.target, ordinal_levels(self.score))
+        """Metrics of answers and touch, also of all candidates: no group whose answers are all alike is selected."""
+        answers = answer_metrics(group.parsed, group.batch.target, ordinal_levels(self.score))
+        return answers | touch_metrics(group.batch.features, self.fns.step_tokens)
 
     def metrics(self, group: Group, learn: Experience) -> dict[str, Array]:
-        """Metrics of the selected groups alone: their advantages, bonuses and touch."""
+        """Metrics of the selected groups alone: their advantages and bonuses."""
         algorithm, reward = self.config.algorithm, group.reward
         return {
             **advantage_metrics(reward, learn.advantage),
             **tactile_use.bonus_metrics(algorithm, reward, group.terms, group.bonus, learn.advantage, group.finite),
-            **touch_metrics(group.batch.features, self.fns.step_tokens),
         }

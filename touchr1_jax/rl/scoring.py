@@ -119,6 +119,8 @@ def left_out_groups(
       of groups in which a term was not finite (`nonfinite_in_total`: every term was finite, but not their sum or a
       square).
     """
+    wide = lambda x: jnp.asarray(x, jnp.promote_types(jnp.result_type(x), jnp.float32))  # in 16 bits 300² is infinite
+    reward, terms = wide(reward), {name: wide(term) for name, term in terms.items()}
     is_finite = lambda x: jnp.all(jnp.isfinite(x), -1)
     by_term = {name: is_finite(term) for name, term in terms.items()}
     all_terms = functools.reduce(jnp.logical_and, by_term.values(), jnp.ones(reward.shape[:1], bool))

@@ -74,12 +74,12 @@ def test_bad_updates_are_left_out_of_the_training_and_counted_in_the_log(tmp_pat
 
 def test_groups_that_a_reward_left_out_are_counted_for_each_stage():
     lines = [
-        {"stage": "grpo/a/0", "step": 0, f"{NONFINITE_IN}spread": 0.5, f"{NONFINITE_IN}format": 0.0},
+        {"stage": "grpo/a/0", "step": 0, f"{NONFINITE_IN}spread": 1e-3, f"{NONFINITE_IN}format": 0.0},
         {"stage": "grpo/a/0", "step": 1, f"{NONFINITE_IN}spread": 0.0, f"{NONFINITE_IN}format": 0.0},
         {"stage": "grpo/b/0", "step": 0, f"{NONFINITE_IN}spread": 0.0},
     ]
     (table,) = left_out_tables(lines)
-    assert table.rows == (("grpo/a/0", 2, 0.0, "spread 25.0%"),)
+    assert table.rows == (("grpo/a/0", 2, 0.0, "spread 0.05 %"),)
     assert left_out_tables(lines[1:]) == ()
 
 

@@ -1,6 +1,7 @@
 """Alarms of a stage that goes on are those of an uninterrupted one, by whatever rules."""
 
 import io
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -11,8 +12,29 @@ from experiments.study.alarm_log import ALARM, alarm_log
 from tests.touchr1_jax.rl.test_active_alarms import HEALTHY
 from touchr1_jax.rl.active_alarms import ACTIVE_RULES
 from touchr1_jax.rl.alarms import WINDOW
+from touchr1_jax.rl.scoring import NONFINITE_IN
+from touchr1_jax.training.loop import SKIPPED
 
 STAGE, STEPS = "grpo/chosen/0", WINDOW + 6
+
+
+def told(directory: Path, metrics: dict[str, float]) -> str:
+    """What a stage prints after one step."""
+    console = Console(file=io.StringIO(), width=300)
+    context = Context(directory, directory / "cache", console)
+    alarm_log(context, STAGE, 0)(0, metrics)
+    context.close()
+    return console.file.getvalue()
+
+
+def test_a_step_that_lost_its_update_raises_the_alarms_of_its_other_numbers(tmp_path):
+    said = told(tmp_path, {SKIPPED: 1.0, "touch_share": 0.0})
+    assert "F10" in said
+    assert "update is left out" in said
+
+
+def test_a_reward_that_is_rarely_not_finite_is_not_said_to_be_always_finite(tmp_path):
+    assert "0.2 % of the groups" in told(tmp_path, {f"{NONFINITE_IN}spread": 1 / 512})
 
 
 @pytest.mark.parametrize("stopped_at", [0, 3, WINDOW + 2, STEPS])

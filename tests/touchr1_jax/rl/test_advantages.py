@@ -155,6 +155,14 @@ def test_credited_segments_compared_over_the_batch_have_signal_though_groups_are
     assert no_signal(algorithm, jnp.ones((2, 1)), {"a": jnp.ones((2, 1))}).all()
 
 
+def test_a_large_reward_that_is_known_leaves_no_rounding_to_later_segments():
+    """In float32, 10,000.3 − 10,000 is not .3; the difference would be an advantage of .7."""
+    a, b = jnp.array([[1e4, 0.0, 5e3]]), jnp.full((1, 3), 0.3)
+    segment = jnp.ones((1, 3, 2), int)
+    found = segment_advantages(Paper(segment_credit=True), a + b, {"a": a, "b": b}, {"a": 0}, segment)
+    np.testing.assert_array_equal(found, 0)
+
+
 def test_a_bonus_after_normalisation_is_centred_in_its_own_group():
     found = added_after(jnp.array([[0.1, 0.1, 0.0], [0.1, 0.0, 0.0]]), 3.0)
     np.testing.assert_allclose(found, [[0.1, 0.1, -0.2], [0.2, -0.1, -0.1]], atol=1e-7)

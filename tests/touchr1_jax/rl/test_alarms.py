@@ -127,6 +127,11 @@ def test_a_single_batch_without_touch_is_reported_at_once():
     assert monitor.update(HEALTHY) == []
 
 
+@pytest.mark.parametrize("share", [0.0, 0.75])
+def test_candidates_without_touch_are_reported_though_others_are_selected(share):
+    assert [a.code for a in AlarmMonitor().update(HEALTHY | {"drawn_touch_share": share})] == ["F10"]
+
+
 def test_a_score_that_stands_on_some_lines_stops_no_check():
     """As on the steps with a checkpoint: the line that has it may be the first of a window or not."""
     monitor = AlarmMonitor()

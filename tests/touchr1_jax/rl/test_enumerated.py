@@ -23,6 +23,7 @@ from touchr1_jax.rl.enumerated import (
     conclusion_place,
     exact_terms,
     level_rewards,
+    of_kept,
 )
 from touchr1_jax.rl.grpo import Group, GRPOEngine, make_grpo_step, start_state
 from touchr1_jax.rl.losses import TokenTerms, grpo_loss
@@ -65,6 +66,19 @@ def test_a_trace_without_conclusion_keeps_its_sampled_reward():
     np.testing.assert_allclose(
         terms(Norm.STD, states=(True, False), sampled=(9.0, 0.1)).advantage, [0.4 / spread, -0.4 / spread], rtol=1e-5
     )
+
+
+def test_a_group_that_earns_nothing_has_no_advantage_without_an_epsilon_either():
+    found = exact_terms(Norm.STD, jnp.log(PROBABILITY), 0 * REWARD, jnp.ones(2, bool), jnp.zeros(2), epsilon=0.0)
+    np.testing.assert_array_equal([*found.advantage, *found.objective], 0)
+
+
+def test_the_expected_reward_of_a_step_is_of_the_groups_that_stay():
+    parts = {"expected_reward": jnp.array(0.2), "loss": jnp.array(0.2)}
+    of = lambda *finite: {name: float(x) for name, x in of_kept(parts, jnp.array(finite)).items()}
+    assert of(True, False) == {"expected_reward": pytest.approx(0.4), "loss": pytest.approx(0.2)}
+    assert of(True, True) == {"expected_reward": pytest.approx(0.2), "loss": pytest.approx(0.2)}
+    assert np.isfinite(of(False, False)["expected_reward"])
 
 
 def test_a_group_of_one_has_no_advantage_and_a_tiny_mean_is_bounded():
@@ -247,6 +261,7 @@ def test_a_level_that_nobody_said_and_whose_reward_is_nan_costs_its_group():
     np.testing.assert_array_equal(found.ids, [LEVELS.level[0]] * 2)
     np.testing.assert_allclose(found.reward[0, 0, :3], 1)
     np.testing.assert_allclose(found.reward[1], 0)
+    np.testing.assert_allclose(found.sampled, [[1, 1], [0, 0]])
 
 
 @pytest.mark.long

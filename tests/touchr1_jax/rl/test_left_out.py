@@ -118,6 +118,15 @@ def test_rewards_whose_sum_or_spread_overflows_are_named_too(big):
     np.testing.assert_array_equal(left_out_groups(jnp.ones((2, 2)), parts)[2], [False, True])
 
 
+def test_rewards_of_a_callers_own_score_are_squared_in_float32():
+    """In 16 bits the square of 300 is infinite."""
+    own = jnp.array([[300, 0], [1, 0]], jnp.float16)
+    reward, terms, finite, _ = left_out_groups(own, {"a": own})
+    assert finite.all()
+    assert reward.dtype == terms["a"].dtype == jnp.float32
+    np.testing.assert_array_equal(reward, own)
+
+
 PARAMS = {"w": jnp.arange(3.0)}
 
 
@@ -153,11 +162,18 @@ def test_dynamic_sampling_logs_what_it_passed_over():
         return jax.device_get(step(state, tiny.question_batch(1, P), FROZEN))[1]
 
     chosen, whole = metrics_of(prompts=2), metrics_of(prompts=P)
-    found = "reward", "accuracy", "degenerate_share", "all_right_share", "nonfinite_share", "idle_share", "gamed_share"
-    for name in found:
+    of_answers = "reward", "accuracy", "degenerate_share", "all_right_share", "idle_share", "gamed_share"
+    for name in (*of_answers, "nonfinite_share", "touch_share"):
         np.testing.assert_allclose(chosen[f"drawn_{name}"], whole[name], rtol=1e-6)
     assert chosen["degenerate_share"] < chosen["drawn_degenerate_share"]
     assert chosen["reward"] != chosen["drawn_reward"]
+
+
+def test_a_step_that_takes_its_state_leaves_the_callers_key():
+    key = jax.random.key(0)
+    state = start_state(PARAMS, OPTIMIZER, key, CONFIG)
+    jax.jit(lambda state: state, donate_argnums=0)(state)
+    jax.random.split(key)
 
 
 def test_trained_parameters_have_32_bits():

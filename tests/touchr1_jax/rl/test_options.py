@@ -11,6 +11,7 @@ import pytest
 
 from tests.touchr1_jax import tiny
 from tests.touchr1_jax.rl.test_grpo import FNS, FROZEN, P, score
+from touchr1_jax.models.lora import LoraConfig, init_adapters
 from touchr1_jax.rl.config import (
     Advantage,
     Average,
@@ -147,16 +148,26 @@ def test_the_kl_in_the_reward_is_a_term_of_it(lagging):
     assert not {"kl", "kl_peak", "kl_cost_peak"} & metrics.keys()  # the loss computes none
 
 
+HALF = jax.tree.map(lambda x: x.astype(jnp.bfloat16), START)
+LORA = LoraConfig(rank=2)
+ADAPTERS = {"adapters": init_adapters(jax.random.key(0), HALF, LORA)}
+ON_HALF = dataclasses.replace(FNS, base=HALF, cache_dtype=jnp.dtype(jnp.bfloat16), lora=LORA)
+
+
 @pytest.mark.long
-def test_a_sampler_that_rounds_otherwise_is_no_kl_in_the_reward():
-    """The policy is its reference and all answers earn alike: what bfloat16 rounds would be an advantage of .06."""
-    config = dataclasses.replace(CONFIG, bfloat16=True, algorithm=Paper(gamma=0.0, kl_in_reward=True))
+@pytest.mark.parametrize(("fns", "start", "bfloat16"), [(FNS, START, True), (ON_HALF, ADAPTERS, False)])
+def test_a_sampler_that_rounds_otherwise_is_no_kl_in_the_reward(fns, start, bfloat16):
+    """The policy is its reference and all answers earn alike: what bfloat16 rounds would be an advantage of .06.
+
+    Also where only the frozen weights under adapters have 16 bits, as those of released models.
+    """
+    config = dataclasses.replace(CONFIG, bfloat16=bfloat16, algorithm=Paper(gamma=0.0, kl_in_reward=True))
     alike = lambda o, t: (jnp.ones(()), {"right": jnp.ones(())}, score(o, t)[2])
     step, state = (
-        make_grpo_step(FNS, alike, OPTIMIZER, config),
-        start_state(START, OPTIMIZER, jax.random.key(1), config),
+        make_grpo_step(fns, alike, OPTIMIZER, config),
+        start_state(start, OPTIMIZER, jax.random.key(1), config),
     )
-    _, metrics = step(state, BATCH, FROZEN._replace(reference=at_precision(config, START)))
+    _, metrics = step(state, BATCH, FROZEN._replace(reference=at_precision(config, start)))
     assert (metrics["sampler_gap"] > 0, metrics["reward_kl"], metrics["advantage_peak"]) == (True, 0, 0)
 
 
