@@ -25,7 +25,7 @@ import tyro
 from rich.console import Console
 
 from experiments.core import numerics, runs, watchers
-from experiments.core.artifacts import DamagedFileError, jsonable, write_sealed
+from experiments.core.artifacts import DamagedFileError, jsonable, make_folder, write_sealed
 from experiments.core.commands import PROG, find, print_error, print_lines, run_command
 from experiments.core.context import Context
 from experiments.core.loops import alarm_tables, left_out_tables
@@ -293,6 +293,7 @@ def _execute(experiment: Experiment[Any], command: Any, about: str, typed: str) 
     try:
         numerics.require_supported()
         require_memory({})
+        make_folder(command.cache_dir / COMPILED, "cache-dir", command.cache_dir)
         processes = join_processes(command.launch)
         common = {"experiment": experiment.name, "config": jsonable(command.config), "code": runs.code_digest()}
         common |= {"versions": runs.versions(), "settings": numerics.settings(), "mesh": jsonable(command.launch.mesh)}
