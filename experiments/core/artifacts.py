@@ -64,9 +64,14 @@ def make_folder(folder: Path, option: str, value: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UnwrittenError(
-            f"{option} is {value}: must be a folder that can be written ({error}); name another by --{option}"
-        ) from error
+        raise no_place(option, value, error) from error
+
+
+def no_place(option: str, value: Path, error: OSError) -> UnwrittenError:
+    """The error of a folder that an option names, in which nothing can be made."""
+    return UnwrittenError(
+        f"{option} is {value}: must be a folder that can be written ({error}); name another by --{option}"
+    )
 
 
 def write_bytes(path: Path, content: bytes) -> None:

@@ -21,7 +21,15 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments.core.artifacts import DamagedFileError, fitting, make_folder, point_link, read_json, write_sealed
+from experiments.core.artifacts import (
+    DamagedFileError,
+    fitting,
+    make_folder,
+    no_place,
+    point_link,
+    read_json,
+    write_sealed,
+)
 from experiments.core.text import MEANINGLESS, SMOKE, duration
 
 PACKAGES = ("touchr1-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "grain", "chex", "numpy")
@@ -91,10 +99,14 @@ def create(home: Path, description: dict[str, Any]) -> Path:
     stamp = datetime.datetime.now(datetime.UTC).strftime("%Y%m%d-%H%M%S")
     for suffix in ("", *(f"-{i:02d}" for i in range(2, 100))):
         directory = home / f"{stamp}{suffix}"
-        with contextlib.suppress(FileExistsError):
+        try:
             directory.mkdir()
-            write_sealed(directory / "config.json", description)
-            return directory
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise no_place("runs-dir", home.parent, error) from error
+        write_sealed(directory / "config.json", description)
+        return directory
     raise RuntimeError(f"{home / stamp} and 98 more were made within this second; wait for the next second")
 
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
@@ -48,7 +49,7 @@ def test_revision_is_clean_dirty_or_unknown(tmp_path, monkeypatch):
 FOREIGN = '{"experiment": "coin", "scale": "a", "config": {}, "command": "b", "git": %s}'
 
 
-def test_runs_of_one_second_get_their_own_directories(tmp_path):
+def test_runs_of_one_second_get_their_own_directories(tmp_path, monkeypatch):
     description = json.loads(FOREIGN % '{"commit": "a", "dirty": false}')
     made = {runs.create(tmp_path / "coin", description) for _ in range(3)}
     assert len(made) == 3
@@ -60,6 +61,9 @@ def test_runs_of_one_second_get_their_own_directories(tmp_path):
     assert runs.newest(tmp_path / "none", {}, finished=False) is None
     with pytest.raises(UnwrittenError, match=r"runs-dir is .*results\.json: must be a folder .* name another"):
         runs.create(max(made) / "results.json" / "coin", description)
+    monkeypatch.setattr(runs.datetime, "datetime", mock.Mock(**{"now.return_value.strftime.return_value": "a" * 300}))
+    with pytest.raises(UnwrittenError, match=r"runs-dir is .*: must be a folder that can be written .* name another"):
+        runs.create(tmp_path / "coin", description)
 
 
 def make_run(home, stamp, *, results=None, total=None):
