@@ -101,7 +101,9 @@ class PhysiclearStudy:
 
 
 def run(config: PhysiclearStudy, context: Context) -> Results:
-    """Validate and train, or predict; `ConfigurationError` without data_dir, or with one of predict and out alone."""
+    """Validate and train, or predict; `ConfigurationError` without data_dir, or with a part of a prediction."""
+    if config.policy is not None and not config.predict:
+        raise ConfigurationError(f"policy is {config.policy}: is read by --predict alone; leave it out, or name videos")
     if bool(config.predict) != (config.out is not None):
         named = " ".join(map(str, config.predict)) or None
         raise ConfigurationError(f"predict is {named}, out {config.out}: give both to predict, or neither")
