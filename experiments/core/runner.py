@@ -9,6 +9,7 @@ command, the cost and the expected result, and it defines `EXPERIMENT`.
 
 import contextlib
 import dataclasses
+import errno
 import functools
 import importlib
 import io
@@ -309,6 +310,8 @@ def _execute(experiment: Experiment[Any], command: Any, about: str, typed: str) 
                 _compute(experiment, command, directory, about, stopping, processes)
     except KNOWN_ERRORS as error:
         told = f"{type(error).__name__}: {error}"
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC:  # libraries do not say of which disk
+            told += f": free some space on the disks of {command.runs_dir} and {command.cache_dir}, then continue"
         print_error(told if directory is None else f"{told}\n{fate()}")  # standard output may be on the full disk
         return 1
     except Stopped as stopped:
