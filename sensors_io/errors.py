@@ -22,6 +22,11 @@ def of_system(error: BaseException) -> bool:
     return isinstance(error, OSError) and error.errno in _OF_SYSTEM
 
 
+def told(error: BaseException) -> str:
+    """Name and text of an error; its `repr` may hold the whole file that it could not decode."""
+    return f"{type(error).__name__}: {error}"
+
+
 class UserError(Exception):
     """Its message names the field, the value, the constraint and the fix, so that a command prints it as one line."""
 

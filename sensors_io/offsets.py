@@ -5,7 +5,7 @@ import pathlib
 from collections.abc import Iterable, Mapping
 from typing import Self
 
-from sensors_io.errors import MALFORMED, UserError
+from sensors_io.errors import MALFORMED, UserError, told
 from sensors_io.json_files import read_json, write_json
 
 
@@ -78,7 +78,7 @@ class Offsets:
                 raise ValueError(f"late_s are {late_s}: must lie within ±{LARGEST_S} s")
             return cls(reference=str(tree["reference"]), sensors=sensors)
         except (OSError, *MALFORMED) as error:
-            raise OffsetsError(f"{path} holds no offsets ({error!r}); make them with `sync`") from error
+            raise OffsetsError(f"{path} holds no offsets ({told(error)}); make them with `sync`") from error
 
 
 LARGEST_S = 2.0

@@ -4,6 +4,7 @@ import contextlib
 import os
 import signal
 import sys
+from importlib.machinery import ExtensionFileLoader
 from types import FrameType, TracebackType
 from typing import TypeVar
 
@@ -13,6 +14,8 @@ ENDING = (signal.SIGTERM, signal.SIGHUP)
 """The signal of a scheduler, and that of a terminal or a connection that was closed."""
 
 AGAIN_S = 0.02  # until a signal that was lost comes again
+
+_LOADING = {method.__code__ for method in (ExtensionFileLoader.create_module, ExtensionFileLoader.exec_module)}
 
 
 class Ended(KeyboardInterrupt):
@@ -27,11 +30,11 @@ def end_as_interrupted() -> None:
     """Raise `Ended` at the first of `ENDING`; a signal that is ignored, as under nohup, stays so.
 
     What is raised within a callback of the garbage collector, such as JAX's, Python only reports: it comes again.
-    What is raised while an extension loads becomes an `ImportError`: where that is caught nowhere, the program ends as
-    by the signal.
+    While an extension loads nothing is raised: some make an `ImportError` of it, and others abort.  The signal comes
+    again; where an `ImportError` of one is caught nowhere, the program ends as by the signal.
     """
-    for number in ENDING:
-        if signal.getsignal(number) is signal.SIG_DFL:
+    for number in (signal.SIGINT, *ENDING):
+        if signal.getsignal(number) is (signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL):
             signal.signal(number, _raise)
     report = sys.unraisablehook
     sys.unraisablehook = lambda lost: (
@@ -83,11 +86,18 @@ def say(text: str) -> None:
 
 
 def _raise(number: int, frame: FrameType | None) -> None:
-    del frame
-    raise Ended(number)
+    while frame is not None:
+        if frame.f_code in _LOADING:
+            _send_later(number)
+            return
+        frame = frame.f_back
+    raise KeyboardInterrupt if number == signal.SIGINT else Ended(number)
 
 
 def _again(error: KeyboardInterrupt) -> None:
-    number = exit_status(error) - 128
+    _send_later(exit_status(error) - 128)
+
+
+def _send_later(number: int) -> None:
     signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(number))
     signal.setitimer(signal.ITIMER_REAL, AGAIN_S)

@@ -21,7 +21,7 @@ from experiments.ask.demo import demo_server
 from experiments.ask.exploring import explored, explorer_folder
 from experiments.ask.inputs import read_contacts, read_touch
 from experiments.ask.page import write_page
-from experiments.core.artifacts import DamagedFileError
+from experiments.core.artifacts import DamagedFileError, make_folder
 from experiments.core.commands import PROG, print_error, print_lines
 from experiments.core.errors import DataError
 from experiments.core.runner import COMPILED
@@ -231,9 +231,11 @@ def run_asking(arguments: Sequence[str]) -> int:
     except ValueError as error:
         print_error(f"{type(error).__name__}: {error}")
         return 2
-    kept = compilations_kept(command.cache_dir / COMPILED) if arguments[0] != "export" else contextlib.nullcontext()
+    compiled, exports = command.cache_dir / COMPILED, arguments[0] == "export"
     try:
-        with kept:
+        if not exports:
+            make_folder(compiled, "cache-dir", command.cache_dir)
+        with contextlib.nullcontext() if exports else compilations_kept(compiled):
             require_backend()
             return command.run()
     except FAILURES as error:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.core.artifacts import write_sealed
+from experiments.core.artifacts import make_folder, write_sealed
 from experiments.study.cache import source_digest
 from sensors_io.units import WorkUnit
 from touchr1_jax.bench.items import read_items
@@ -23,6 +23,7 @@ def score_units(
     asked, listed = read_items(items), {}
     for path in (*answers, *([by_sight] if by_sight else [])):
         read_answers(read_lines(path), asked, str(path))
+    make_folder(cache_dir / SCORES, "cache-dir", cache_dir)
     for path in dict.fromkeys(answers):
         sum_ = hashlib.sha256(source_digest(()).encode())
         for one in (items, path, *((by_sight,) if by_sight else ())):

@@ -59,6 +59,21 @@ def jsonable(value: Any, where: str = "value") -> Any:
     raise TypeError(f"{where} is a {type(value).__name__}: it has no JSON form; convert it to numbers, text or lists")
 
 
+def make_folder(folder: Path, option: str, value: Path) -> None:
+    """Make a folder in the one that an option names; `UnwrittenError` if that is none or cannot be written."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise no_place(option, value, error) from error
+
+
+def no_place(option: str, value: Path, error: OSError) -> UnwrittenError:
+    """The error of a folder that an option names, in which nothing can be made."""
+    return UnwrittenError(
+        f"{option} is {value}: must be a folder that can be written ({error}); name another by --{option}"
+    )
+
+
 def write_bytes(path: Path, content: bytes) -> None:
     """Publish a file by way of a flushed temporary sibling; `UnwrittenError` if it does not reach the disk."""
     if path.exists() and not path.is_file():  # a device would be replaced by a file

@@ -229,12 +229,22 @@ def _listing_of_runs(name: str, question: str, runs_dir: Path) -> list[str]:
 def _past_runs(home: Path) -> tuple[list[runs.PastRun], list[str]]:
     """The readable runs under `runs/NAME`, the newest first, and the errors of the others."""
     past, damaged = [], []
-    for directory in runs.started(home):
+    try:
+        begun = runs.started(home)
+    except OSError as error:
+        return [], [_unread(error)]
+    for directory in begun:
         try:
             past.append(runs.read_run(directory))
-        except (DamagedFileError, OSError) as error:
+        except DamagedFileError as error:
             damaged.append(str(error))
+        except OSError as error:
+            damaged.append(_unread(error))
     return past, damaged
+
+
+def _unread(error: OSError) -> str:
+    return f"{error}: must be readable; correct its permissions, or move its run away"
 
 
 def print_lines(*texts: str) -> None:

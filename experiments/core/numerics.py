@@ -30,6 +30,7 @@ UNSUPPORTED = {
 """Settings of JAX that no experiment runs with, and the reason."""
 
 DEFAULTS: Mapping[str, Any] = {
+    "eager_constant_folding": False,
     "jax_high_dynamic_range_gumbel": False,
     "jax_random_seed_offset": 0,
     "jax_softmax_custom_jvp": False,

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from experiments.core.commands import print_error, print_lines
 from sensors_io.remote import Mirror, StoreError
-from touchr1_jax.training.checkpoint import CHECKSUMS
+from touchr1_jax.training.checksums import CHECKSUMS
 
 EVERY_S = 60.0  # between two copies: what a machine computed in the last minute before it is lost is computed again
 

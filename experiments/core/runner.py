@@ -9,6 +9,7 @@ command, the cost and the expected result, and it defines `EXPERIMENT`.
 
 import contextlib
 import dataclasses
+import errno
 import functools
 import importlib
 import io
@@ -25,7 +26,7 @@ import tyro
 from rich.console import Console
 
 from experiments.core import numerics, runs, watchers
-from experiments.core.artifacts import DamagedFileError, jsonable, write_sealed
+from experiments.core.artifacts import DamagedFileError, jsonable, make_folder, write_sealed
 from experiments.core.commands import PROG, find, print_error, print_lines, run_command
 from experiments.core.context import Context
 from experiments.core.loops import alarm_tables, left_out_tables
@@ -293,6 +294,7 @@ def _execute(experiment: Experiment[Any], command: Any, about: str, typed: str) 
     try:
         numerics.require_supported()
         require_memory({})
+        make_folder(command.cache_dir / COMPILED, "cache-dir", command.cache_dir)
         processes = join_processes(command.launch)
         common = {"experiment": experiment.name, "config": jsonable(command.config), "code": runs.code_digest()}
         common |= {"versions": runs.versions(), "settings": numerics.settings(), "mesh": jsonable(command.launch.mesh)}
@@ -308,6 +310,8 @@ def _execute(experiment: Experiment[Any], command: Any, about: str, typed: str) 
                 _compute(experiment, command, directory, about, stopping, processes)
     except KNOWN_ERRORS as error:
         told = f"{type(error).__name__}: {error}"
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC:  # libraries do not say of which disk
+            told += f": free some space on the disks of {command.runs_dir} and {command.cache_dir}, then continue"
         print_error(told if directory is None else f"{told}\n{fate()}")  # standard output may be on the full disk
         return 1
     except Stopped as stopped:

@@ -21,7 +21,15 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments.core.artifacts import DamagedFileError, UnwrittenError, fitting, point_link, read_json, write_sealed
+from experiments.core.artifacts import (
+    DamagedFileError,
+    fitting,
+    make_folder,
+    no_place,
+    point_link,
+    read_json,
+    write_sealed,
+)
 from experiments.core.text import MEANINGLESS, SMOKE, duration
 
 PACKAGES = ("touchr1-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "grain", "chex", "numpy")
@@ -87,19 +95,18 @@ def versions() -> dict[str, str]:
 
 def create(home: Path, description: dict[str, Any]) -> Path:
     """Make `runs/NAME/STAMP` with its `config.json`; the stamp is the time in UTC, made unique by a suffix."""
-    try:
-        home.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UnwrittenError(
-            f"runs-dir is {home.parent}: must be a folder that can be written ({error}); name another by --runs-dir"
-        ) from error
+    make_folder(home, "runs-dir", home.parent)
     stamp = datetime.datetime.now(datetime.UTC).strftime("%Y%m%d-%H%M%S")
     for suffix in ("", *(f"-{i:02d}" for i in range(2, 100))):
         directory = home / f"{stamp}{suffix}"
-        with contextlib.suppress(FileExistsError):
+        try:
             directory.mkdir()
-            write_sealed(directory / "config.json", description)
-            return directory
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise no_place("runs-dir", home.parent, error) from error
+        write_sealed(directory / "config.json", description)
+        return directory
     raise RuntimeError(f"{home / stamp} and 98 more were made within this second; wait for the next second")
 
 
@@ -150,7 +157,18 @@ def continuing(command: str) -> str:
 def started(home: Path) -> list[Path]:
     """The run directories under `runs/NAME`, the newest first; one without `config.json` never started."""
     found = home.iterdir() if home.is_dir() else ()
-    return sorted((p for p in found if not p.is_symlink() and (p / "config.json").exists()), reverse=True)
+    return sorted((p for p in found if not p.is_symlink() and _has_config(p)), reverse=True)
+
+
+def _has_config(directory: Path) -> bool:
+    """True also where permissions hide the answer: who reads such a run learns that."""
+    try:
+        (directory / "config.json").stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError:
+        return True
+    return True
 
 
 def is_finished(directory: Path) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from experiments.core.artifacts import read_json
-from touchr1_jax.training.checkpoint import CHECKSUMS
+from touchr1_jax.training.checksums import CHECKSUMS
 
 STATE = "state of "  # begins the name of the digest of a stage's checkpoints
 

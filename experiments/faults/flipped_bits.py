@@ -31,7 +31,8 @@ from sensors_io.errors import UserError
 from sensors_io.records import RecordStore
 from touchr1_jax.models import saved_policy
 from touchr1_jax.models.load import WeightsError
-from touchr1_jax.training.checkpoint import CheckpointError, DamagedCheckpointError, changed_files
+from touchr1_jax.training.checkpoint import CheckpointError, DamagedCheckpointError
+from touchr1_jax.training.checksums import changed_files
 
 FOUND, SAME, WRONG, RAW, UNREAD = "found", "read the same", "WRONG", "RAW ERROR", "never read back"
 READINGS = (FOUND, SAME, UNREAD, WRONG, RAW)

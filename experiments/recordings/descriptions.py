@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from experiments.core.context import Context
 from experiments.recordings.scene_presses import press_pictures
-from sensors_io.errors import MALFORMED
+from sensors_io.errors import MALFORMED, told
 from sensors_io.importers.keep import ImportSourceError, Skip
 from sensors_io.importers.physiclear import read_labels
 from sensors_io.importers.video import VideoError
@@ -100,7 +100,7 @@ def read_ratings(path: Path) -> dict[str, Float[np.ndarray, "A"]]:
         table = json.loads(path.read_text(encoding="utf-8"))["objects"]
         return {n: np.array([float(r.get(a.name, np.nan)) for a in LANGUAGE.attributes]) for n, r in table.items()}
     except MALFORMED as error:
-        raise ImportSourceError(f"{path}: {error!r}; correct the entry or remove the file") from error
+        raise ImportSourceError(f"{path}: {told(error)}; correct the entry or remove the file") from error
 
 
 def videos_of(places: Sequence[Path]) -> list[Path]:

@@ -101,9 +101,12 @@ class PhysiclearStudy:
 
 
 def run(config: PhysiclearStudy, context: Context) -> Results:
-    """Validate and train, or predict; `ConfigurationError` without data_dir, or with one of predict and out alone."""
+    """Validate and train, or predict; `ConfigurationError` without data_dir, or with a part of a prediction."""
+    if config.policy is not None and not config.predict:
+        raise ConfigurationError(f"policy is {config.policy}: is read by --predict alone; leave it out, or name videos")
     if bool(config.predict) != (config.out is not None):
-        raise ConfigurationError(f"predict is {config.predict}, out {config.out}: give both to predict, or neither")
+        named = " ".join(map(str, config.predict)) or None
+        raise ConfigurationError(f"predict is {named}, out {config.out}: give both to predict, or neither")
     if config.out is not None:
         return predict(config, config.out, context)
     if config.data_dir is None:

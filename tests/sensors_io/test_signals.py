@@ -79,6 +79,28 @@ except BaseException as error:
     assert ended.stdout == "printed before\n"
 
 
+@pytest.mark.parametrize("number", ALL)
+def test_a_signal_while_an_extension_loads_comes_once_it_is_loaded(number):
+    """Extensions by nanobind abort the process at what is raised then."""
+    code = f"""
+import enum, signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from sensors_io.signals import end_as_interrupted
+end_as_interrupted()
+make, struck = enum.EnumType.__call__, []
+def strike(*args, **names):
+    if sys._getframe(1).f_code.co_name == "_call_with_frames_removed" and not struck:  # by the extension itself
+        struck.append(signal.raise_signal({number}))
+    return make(*args, **names)
+enum.EnumType.__call__ = strike
+import jaxlib.xla_client
+print("loaded", len(struck), flush=True)
+time.sleep(9)
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (128 + number, "interrupted: run the same command again\n")
+
+
 def test_a_signal_that_is_ignored_stays_so():
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     end_as_interrupted()

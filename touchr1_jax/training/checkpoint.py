@@ -24,11 +24,7 @@ from jax.experimental import multihost_utils
 from jaxtyping import Array, UInt32
 from orbax.checkpoint.checkpoint_managers import AnyPreservationPolicy, BestN, LatestN
 
-CHECKSUMS = "checksums.json"
-"""In a checkpoint's folder: CRC-32 of every file, written once all others are in place."""
-
-_STAMPED = "_CHECKPOINT_METADATA"
-"""Orbax's file of times, which it writes once more after the checksums; nothing of the state depends on it."""
+from touchr1_jax.training.checksums import CHECKSUMS, changed_files, file_checksums, old_checkpoints
 
 MOST_SAID = 240
 """Characters of a library's error that a message quotes."""
@@ -117,6 +113,7 @@ class Checkpoints:
             async_options=ocp.AsyncOptions(post_finalization_callback=self._sign),
         )
         try:
+            self._remove_old(keep)
             self._set_aside_unscored()
             self._manager = ocp.CheckpointManager(self._directory, options=options)
         except _FAILURES as error:
@@ -239,6 +236,13 @@ class Checkpoints:
         if not where.is_dir() or changed_files(where):
             self._print(f"{where}, the best so far, is damaged or gone: put a copy back, unless a later one is as good")
 
+    def _remove_old(self, keep: int) -> None:
+        """Remove what a killed process had not removed, or only in part."""
+        for where in old_checkpoints(self._directory, keep, self._better is not None):
+            if jax.process_index() == 0:
+                shutil.rmtree(where)
+        multihost_utils.sync_global_devices("removed old checkpoints")
+
     def _set_aside_unscored(self) -> None:
         """Set checkpoints aside whose score is not what was saved, before Orbax ranks by it."""
         for where in sorted(self._directory.glob("[0-9]*")) if self._better else ():
@@ -292,7 +296,7 @@ class Checkpoints:
         """Write the checksums of a checkpoint into its temporary folder, before Orbax renames it."""
         if jax.process_index() == 0:
             (where,) = self._directory.glob(f"{self._saving}.orbax-checkpoint-tmp*")
-            (where / CHECKSUMS).write_text(json.dumps(_file_checksums(where)), encoding="utf-8")
+            (where / CHECKSUMS).write_text(json.dumps(file_checksums(where)), encoding="utf-8")
 
     def _set_aside(self, step: int) -> Path:
         names = itertools.chain([f"damaged-{step}"], (f"damaged-{step}-{i}" for i in itertools.count(2)))
@@ -356,27 +360,6 @@ def _digests(state: Any) -> dict[str, int]:
     paths = (path for path, _ in jax.tree.leaves_with_path(state))
     names = (jax.tree_util.keystr(path, simple=True, separator="/") for path in paths)
     return dict(zip(names, numbers.tolist(), strict=True))
-
-
-def _file_checksums(where: Path, inside: str = "") -> dict[str, int]:
-    """CRC-32 of every file below a folder, or a folder inside of it, by its path in it."""
-    paths = (where / inside).rglob("*")
-    files = sorted(path for path in paths if path.is_file() and path.name not in (CHECKSUMS, _STAMPED))
-    return {path.relative_to(where).as_posix(): zlib.crc32(path.read_bytes()) for path in files}
-
-
-def changed_files(where: Path, inside: str = "") -> list[str]:
-    """Files of a checkpoint, or of a folder in it, that differ from what was saved; none if it has no checksums, as
-    in earlier versions.
-    """
-    path = where / CHECKSUMS
-    if not path.is_file():
-        return []
-    try:
-        saved, found = json.loads(path.read_text(encoding="utf-8")), _file_checksums(where, inside)
-        return sorted(name for name, x in saved.items() if name.startswith(inside) and found.get(name) != x)
-    except (OSError, ValueError, AttributeError):
-        return [CHECKSUMS]
 
 
 def _crc32(value: Any) -> int:

@@ -87,6 +87,8 @@ def test_anybody_is_scored(directory, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("experiments.bench.score_units.metric_rows", None)
     assert main(score) == 0  # what was scored is not scored again
     assert capsys.readouterr().out == shown
+    assert main([*score[:-1], str(said)]) == 1
+    assert f"cache-dir is {said}: must be a folder" in capsys.readouterr().err
     write_lines(said, [{"id": "nobody", "text": "?"}])
     assert main(score) == 1
     assert "line 1: id is 'nobody'" in capsys.readouterr().err

@@ -63,7 +63,10 @@ def test_cores_change_no_bit_of_linear_algebra():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("name", "value"), [("jax_default_prng_impl", "rbg"), ("jax_softmax_custom_jvp", None)])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("jax_default_prng_impl", "rbg"), ("jax_softmax_custom_jvp", None), ("eager_constant_folding", True)],
+)
 def test_a_run_is_not_continued_under_other_settings(tmp_path, capsys, name, value):
     order = ["coin", "--runs-dir", str(tmp_path), "--cache-dir", str(tmp_path / "data"), "--scale", "smoke"]
     assert main(order, package=FAKES) == 0

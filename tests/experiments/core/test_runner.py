@@ -1,9 +1,11 @@
 """The command line end to end: finding, overriding, running, continuing, stopping."""
 
 import dataclasses
+import errno
 import json
 import signal
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
@@ -191,6 +193,13 @@ def test_a_run_that_is_moved_while_it_goes_on_ends_and_is_whole_once_it_is_back(
     assert run(*arguments) == 0
     assert run(*arguments) == 0
     assert (aside / "metrics.jsonl").read_bytes() == (directories()[0] / "metrics.jsonl").read_bytes()
+
+
+def test_a_full_disk_is_named_with_the_folders_that_may_be_on_it(monkeypatch, capsys):
+    full = mock.Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
+    monkeypatch.setattr(coin, "train", full)
+    assert run("coin", "--cache-dir", "kept") == 1
+    assert "No space left on device: free some space on the disks of runs and kept, then" in capsys.readouterr().err
 
 
 def test_a_page_that_cannot_be_written_does_not_hide_what_ended_the_run(monkeypatch):

@@ -7,10 +7,13 @@ import re
 import subprocess
 import sys
 import threading
+from pathlib import Path
+from unittest import mock
 
 import pytest
 
 from experiments.__main__ import main as start
+from experiments.ask.command import run_asking
 from experiments.core import runs
 from experiments.core.artifacts import DamagedFileError, UnwrittenError, write_json
 from experiments.core.runner import main
@@ -46,7 +49,7 @@ def test_revision_is_clean_dirty_or_unknown(tmp_path, monkeypatch):
 FOREIGN = '{"experiment": "coin", "scale": "a", "config": {}, "command": "b", "git": %s}'
 
 
-def test_runs_of_one_second_get_their_own_directories(tmp_path):
+def test_runs_of_one_second_get_their_own_directories(tmp_path, monkeypatch):
     description = json.loads(FOREIGN % '{"commit": "a", "dirty": false}')
     made = {runs.create(tmp_path / "coin", description) for _ in range(3)}
     assert len(made) == 3
@@ -58,6 +61,9 @@ def test_runs_of_one_second_get_their_own_directories(tmp_path):
     assert runs.newest(tmp_path / "none", {}, finished=False) is None
     with pytest.raises(UnwrittenError, match=r"runs-dir is .*results\.json: must be a folder .* name another"):
         runs.create(max(made) / "results.json" / "coin", description)
+    monkeypatch.setattr(runs.datetime, "datetime", mock.Mock(**{"now.return_value.strftime.return_value": "a" * 300}))
+    with pytest.raises(UnwrittenError, match=r"runs-dir is .*: must be a folder that can be written .* name another"):
+        runs.create(tmp_path / "coin", description)
 
 
 def make_run(home, stamp, *, results=None, total=None):
@@ -107,7 +113,14 @@ def test_who_looks_at_a_run_does_not_keep_it_from_going_on(tmp_path):
                 pass
 
 
+UNREADABLE = "a" * 300
+"""As the target of a link: a name that raises an error whoever asks, as a folder without permission does to some."""
+
+
 def test_a_damaged_run_hides_no_other(tmp_path, capsys):
+    (tmp_path / "coin").mkdir()
+    (tmp_path / "coin" / "20260104-000000").mkdir()
+    (tmp_path / "coin" / "20260104-000000" / "config.json").symlink_to(UNREADABLE)
     make_run(tmp_path, "20260101-000000", results=FINISHED, total=2)
     (make_run(tmp_path, "20260102-000000") / "config.json").write_text("{")
     (make_run(tmp_path, "20260103-000000") / "config.json").write_text('{"model_type": "qwen2_5_vl"}')
@@ -117,6 +130,12 @@ def test_a_damaged_run_hides_no_other(tmp_path, capsys):
         assert "20260101-000000  default, code 0123456+: finished, 2 s" in out
         assert "20260102-000000/config.json is damaged" in out
         assert "20260103-000000/config.json is not that of a run" in out
+        assert "20260104-000000/config.json'" in out
+        assert out.count("must be readable; correct its permissions") == 1
+    (tmp_path / "coin").rename(tmp_path / "away")
+    (tmp_path / "coin").symlink_to(UNREADABLE)
+    assert main(["list", "--runs-dir", str(tmp_path)], package=FAKES) == 0
+    assert "coin': must be readable" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("file", ["config.json", "results.json", "timing.json", ".lock"])
@@ -182,6 +201,17 @@ def test_an_experiment_without_runs_and_an_unknown_one_are_named(tmp_path, capsy
     for wrong in (str(tmp_path / "file"), str(tmp_path / "nowhere"), "s3://bucket/runs"):
         assert main(["list", "--runs-dir", wrong], package=FAKES) == 2
         assert "must be a folder of this machine" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("place", ["file", "file/below"])
+@pytest.mark.parametrize("command", [["coin"], ["ask", "generated"]])
+def test_a_cache_that_is_no_folder_is_refused_before_anything_is_made(tmp_path, monkeypatch, capsys, command, place):
+    monkeypatch.chdir(tmp_path)
+    Path("file").touch()
+    run = main if command == ["coin"] else run_asking
+    assert run([*command, "--cache-dir", place], **({"package": FAKES} if run is main else {})) == 1
+    assert f"cache-dir is {place}: must be a folder that can be written" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 @pytest.mark.parametrize("place", ["memory://x/runs", "memory:/x"])

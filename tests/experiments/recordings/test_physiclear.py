@@ -107,7 +107,12 @@ def test_what_cannot_be_fitted_is_refused_before_videos_are_read(name, arguments
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"), [(["--predict", "x"], "give both to predict"), ([], "data_dir is None")]
+    ("arguments", "message"),
+    [
+        (["--predict", "x", "y"], "predict is x y, out None: give both to predict"),
+        (["--policy", "x"], "policy is x: is read by --predict alone"),
+        ([], "data_dir is None"),
+    ],
 )
 def test_an_incomplete_command_is_refused(arguments, message, tmp_path, capsys):
     assert main(["physiclear", *arguments, "--runs-dir", str(tmp_path), "--cache-dir", str(tmp_path / "c")]) == 1

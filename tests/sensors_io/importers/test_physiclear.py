@@ -92,6 +92,15 @@ def test_labels_that_cannot_be_used_are_named(tmp_path, items, message):
     refused(ImportSourceError, message, read_labels, tmp_path / "labels.json")
 
 
+def test_labels_of_another_encoding_are_named_and_not_quoted(tmp_path):
+    (tmp_path / "labels.json").write_text("{}" * 500, encoding="utf-16")
+    with pytest.raises(
+        ImportSourceError, match=r"labels\.json: UnicodeDecodeError: 'utf-8' codec can't decode"
+    ) as found:
+        read_labels(tmp_path / "labels.json")
+    assert len(str(found.value)) < 300
+
+
 @pytest.mark.skipif("TOUCHR1_PHYSICLEAR" not in os.environ, reason="TOUCHR1_PHYSICLEAR does not name the recordings")
 def test_the_real_recordings(tmp_path):
     source = pathlib.Path(os.environ["TOUCHR1_PHYSICLEAR"])

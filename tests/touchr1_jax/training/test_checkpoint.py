@@ -13,7 +13,8 @@ import orbax.checkpoint as ocp
 import pytest
 
 from tests.touchr1_jax.training.stepping import feed, start, step
-from touchr1_jax.training.checkpoint import CHECKSUMS, CheckpointError, Checkpoints, DamagedCheckpointError, digest
+from touchr1_jax.training.checkpoint import CheckpointError, Checkpoints, DamagedCheckpointError, digest
+from touchr1_jax.training.checksums import CHECKSUMS
 
 UNREAD = ("_CHECKPOINT_METADATA", "commit_success.txt")
 """Files that Orbax writes after the checksums; no state depends on them."""
@@ -259,6 +260,24 @@ class TestDamagedBest:
         with Checkpoints(stage, better="higher", print_=lambda text: None) as checkpoints:
             assert checkpoints.restore(LIKE).step == 2
             assert checkpoints.best(LIKE).step == 2
+
+    def test_what_a_killed_process_had_not_removed_is_removed(self, stage, tmp_path_factory):
+        """An old checkpoint, whole or without one of its files; the newest must be intact."""
+        old = tmp_path_factory.mktemp("old") / "1"
+        with Checkpoints(old.parent, better="higher") as checkpoints:
+            checkpoints.save(1, {"x": jnp.full(2, 1)}, 1, 1.0)
+        told: list[str] = []
+        for file in (None, *(path for path in old.rglob("*") if path.is_file())):
+            shutil.copytree(old, stage / "1")
+            if file is not None:
+                (stage / "1" / file.relative_to(old)).unlink()
+            with Checkpoints(stage, keep=1, better="higher", print_=told.append):
+                assert sorted(path.name for path in stage.iterdir()) == ["2", "3"]
+        assert not told
+        shutil.copytree(old, stage / "1")
+        (stage / "3" / "data" / "metadata").write_text("{}")
+        with Checkpoints(stage, keep=1, better="higher") as checkpoints:
+            assert (stage / "1").is_dir()
 
     @pytest.mark.parametrize(("better", "best"), [("higher", 3), ("lower", 4)])
     def test_of_equal_ones_the_newest_is_the_best_however_often_the_run_is_resumed(self, tmp_path, better, best):

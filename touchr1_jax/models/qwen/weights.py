@@ -246,7 +246,8 @@ def _raw_tensors(directory: Path) -> dict[str, safetensors.TensorEntry]:
         if odd:
             raise ValueError(f"{odd[0]!r} must be the name of a file beside it")
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ValueError(f"{index} is no index: must be JSON with a weight_map ({error!r}); fetch it again") from error
+        told = f"{type(error).__name__}: {error}"  # its `repr` may hold the whole file
+        raise ValueError(f"{index} is no index: must be JSON with a weight_map ({told}); fetch it again") from error
     entries: dict[str, safetensors.TensorEntry] = {}
     for shard in sorted(set(place.values())):
         if not (directory / shard).is_file():
