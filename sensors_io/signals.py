@@ -27,7 +27,7 @@ class Ended(KeyboardInterrupt):
 
 
 def end_as_interrupted() -> None:
-    """Raise `Ended` at the first of `ENDING`; a signal that is ignored, as under nohup, stays so.
+    """Raise `Ended` at the first of `ENDING`, and KeyboardInterrupt at Ctrl-C; a signal that is ignored stays so.
 
     What is raised within a callback of the garbage collector, such as JAX's, Python only reports: it comes again.
     While an extension loads nothing is raised: some make an `ImportError` of it, and others abort.  The signal comes
@@ -85,12 +85,17 @@ def say(text: str) -> None:
         return
 
 
-def _raise(number: int, frame: FrameType | None) -> None:
-    while frame is not None:
-        if frame.f_code in _LOADING:
-            _send_later(number)
-            return
+def loads_extension(frame: FrameType | None) -> bool:
+    """True while an extension loads in this frame or around it."""
+    while frame is not None and frame.f_code not in _LOADING:
         frame = frame.f_back
+    return frame is not None
+
+
+def _raise(number: int, frame: FrameType | None) -> None:
+    if loads_extension(frame):
+        _send_later(number)
+        return
     raise KeyboardInterrupt if number == signal.SIGINT else Ended(number)
 
 

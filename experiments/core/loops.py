@@ -108,7 +108,7 @@ def left_out_tables(lines: Iterable[Mapping[str, Any]]) -> tuple[Table, ...]:
         share = {name: sum(line.get(name, 0.0) for line in of_stage) / len(of_stage) for name in terms}
         updates = max(line.get(SKIPPED, 0.0) for line in of_stage)
         if updates or any(share.values()):
-            named = ", ".join(f"{name.removeprefix(NONFINITE_IN)} {100 * x:.2g} %" for name, x in share.items() if x)
+            named = ", ".join(f"{name.removeprefix(NONFINITE_IN)} {100 * x:.3g} %" for name, x in share.items() if x)
             rows.append({"stage": stage, "steps": len(of_stage), "updates left out": updates, "groups left out": named})
     note = "A gradient, the policy after it, or a reward in the named share of the groups, was NaN or infinite."
     return (named_table("Left out of training", rows, note=note),) if rows else ()

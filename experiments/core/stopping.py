@@ -9,7 +9,7 @@ import weakref
 from collections.abc import Callable, Iterator
 from types import FrameType
 
-from sensors_io.signals import ENDING, hidden_in
+from sensors_io.signals import ENDING, hidden_in, loads_extension
 
 SIGNALS = (signal.SIGINT, *ENDING)
 """Control-C, the signal that a scheduler sends before it takes the machine away, and that of a closed terminal."""
@@ -100,22 +100,23 @@ class Stopping:
             self._patient += blocks
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        del frame
         for n in SIGNALS:
             if signal.getsignal(n) is not signal.SIG_IGN:
                 signal.signal(n, signal.SIG_DFL)
         self._number = number
         signal.setitimer(signal.ITIMER_REAL, AGAIN_S, AGAIN_S)
         if not self._patient:
+            if loads_extension(frame):  # some abort at an exception; the signal comes again
+                return
             raise self._stopped(number)
         with contextlib.suppress(OSError):  # nobody may be reading
             os.write(STDERR, PATIENCE)  # a print could strike within another
 
     def _again(self, number: int, frame: FrameType | None) -> None:
         """Raise another `Stopped` if the last one is gone; while it propagates, it is alive."""
-        del number, frame
+        del number
         alive = self._raised is not None and self._raised() is not None
-        if self._number is not None and not self._patient and not alive:
+        if self._number is not None and not self._patient and not alive and not loads_extension(frame):
             raise self._stopped(self._number)
 
     def _stopped(self, number: int) -> Stopped:

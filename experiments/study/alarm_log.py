@@ -31,7 +31,7 @@ def alarm_log(
         for name, share in metrics.items():
             if name.startswith(NONFINITE_IN) and share > 0:
                 reward = name.removeprefix(NONFINITE_IN)
-                what = f"reward {reward!r} is not finite in {100 * share:.2g} % of the groups, which are left out"
+                what = f"reward {reward!r} is not finite in {100 * share:.3g} % of the groups, which are left out"
                 notes[name] = f"{what}; the report counts all of them"
         for name, note in notes.items():
             if aloud and name not in printed:

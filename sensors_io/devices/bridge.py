@@ -42,7 +42,7 @@ _KINDS = "biuf"  # of arrays: booleans, integers, floats; never Python objects
 _LAST_WORDS = 4096  # bytes of the server's standard error that are kept for a message
 _LAST_WORDS_S = 0.5  # that they may come after the end of its answers; its children may live on and hold the pipe
 _PIPE_BYTES = 1 << 20  # the most that Linux gives without privileges: a picture of 640 × 480
-_OLDEST_NS = 60 * NS_PER_S  # of a frame: no pipe holds it for longer
+_FARTHEST_NS = 60 * NS_PER_S  # of a stamp from its arrival
 _RELEASE_S = 3.0  # for the SDK to let its sensor go
 _OURS = ("PYTHONPATH", "PYTHONHOME")  # would make the vendor's Python import what belongs to this one
 
@@ -241,12 +241,13 @@ class Bridge:
         described, arrays = unpack(*frame)
         picture, fields = to_schema(arrays)
         now_ns = time.monotonic_ns()
-        stamp_ns = min(int(described["stamp_ns"]), now_ns)
-        if now_ns - stamp_ns > _OLDEST_NS:
+        stamp_ns = int(described["stamp_ns"])
+        if abs(now_ns - stamp_ns) > _FARTHEST_NS:
             raise DeviceDataError(
                 f"bridge frame has stamp_ns {stamp_ns}, {(now_ns - stamp_ns) / NS_PER_S:.0f} s before it came: must be "
-                "time.monotonic_ns() when the SDK returned; correct the adapter"
+                "time.monotonic_ns() when the SDK returned; correct the adapter, unless this process was stopped"
             )
+        stamp_ns = min(stamp_ns, now_ns)
         return Sample(host_time_ns=stamp_ns, index=described["number"], frame=picture, arrays=fields)
 
     def _take(self) -> tuple[bytes, bytes] | None:

@@ -21,6 +21,7 @@ told by the period and repeats by equal pictures.
 import _thread
 import importlib
 import json
+import operator
 import os
 import struct
 import sys
@@ -141,7 +142,7 @@ def pack(number, stamp_ns, serial, arrays):
     given = {name: array for name, array in arrays.items() if array is not None}
     described = [{"name": n, "dtype": a.dtype.str, "shape": list(a.shape)} for n, a in given.items()]
     tree = {"number": number, "stamp_ns": stamp_ns, "serial": serial, "arrays": described}
-    header = json.dumps(tree, default=int).encode()  # numbers may be NumPy's
+    header = json.dumps(tree, default=operator.index).encode()  # numbers may be NumPy's
     payload = b"".join(a.tobytes() for a in given.values())
     return PREFIX.pack(MAGIC, len(header), len(payload)) + header + payload
 

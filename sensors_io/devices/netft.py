@@ -132,7 +132,8 @@ class _RateCheck:
     """Compares the numbers of records, over the rate they are said to have, with the times of their arrival.
 
     No record is early: the least delay in each quarter of a second stays where it was if the rate is right, and drifts
-    if it is not.  Records that lie there when the reader comes, for it was held up, tell no delay.
+    if it is not.  A record that was there before the reader asked may be late by the reader's own delay, so that only
+    its being early tells a wrong rate.
     """
 
     _EVERY_NS = NS_PER_S // 4
@@ -163,17 +164,20 @@ class _RateCheck:
             return
         self._records += (number - self._number + 2**31) % 2**32 - 2**31  # one may overtake another; numbers run around
         self._number = number
-        if not waited:
-            return
-        self._waited += 1
         elapsed_ns = arrival_ns - self._first_ns
         late_ns = elapsed_ns - round(self._records * NS_PER_S / self._rate_hz)
+        allowed_ns = self._ALLOWED_NS + self._DRIFT * elapsed_ns
+        if not waited:
+            if self._usual is not None and elapsed_ns > 3 * self._EVERY_NS and late_ns < self._usual - allowed_ns:
+                self.measured_hz = self._records * NS_PER_S / elapsed_ns
+            return
+        self._waited += 1
         self._least = late_ns if self._least is None else min(self._least, late_ns)
         if arrival_ns < self._until_ns or self._waited < self._LEAST:
             return
         if self._usual is None or elapsed_ns < 3 * self._EVERY_NS:  # the very first record may have waited
             self._usual = self._least if self._usual is None else min(self._usual, self._least)
-        if abs(self._least - self._usual) > self._ALLOWED_NS + self._DRIFT * elapsed_ns:
+        if abs(self._least - self._usual) > allowed_ns:
             self.measured_hz = self._records * NS_PER_S / elapsed_ns
         self._least, self._waited, self._until_ns = None, 0, arrival_ns + self._EVERY_NS
 
@@ -271,7 +275,9 @@ class NetFt:
             raise DeviceLostError("NetFT is not open; use it in a with block")
         try:
             self._socket.settimeout(timeout_s)
-            waited = not select.select([self._socket], [], [], 0)[0]
+            there = select.poll()
+            there.register(self._socket, select.POLLIN)
+            waited = not there.poll(0)
             datagram = self._socket.recv(65_535)
         except TimeoutError as silence:
             raise DeviceTimeoutError(

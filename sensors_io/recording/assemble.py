@@ -147,7 +147,7 @@ class _Shared:
         incomplete = np.any([force.out_of_range, *broken.values()], axis=0)
         flags |= np.where(incomplete, np.uint32(Flag.INCOMPLETE), np.uint32(0))
         if "flags" in frames[0].arrays:  # of records that are replayed
-            flags |= np.stack([e.arrays["flags"] for e in frames])
+            flags |= np.stack([e.arrays["flags"] for e in frames]).astype(np.uint32)
         device = [e.plain["device_time_ns"] for e in frames]
         timed = all(t is not None and _INT64.min <= t <= _INT64.max for t in device)
         pictures = [e.arrays["frame"] for e in frames if "frame" in e.arrays]
@@ -270,14 +270,15 @@ class _Force:
 def _gaps(time_ns: np.ndarray, index: Seq[int | None], period_s: float | None) -> np.ndarray:
     """Frames at which the counter does not go on by one, or, without one, that come too late for the period.
 
-    Where that is unknown, too late is three times the median step, as times may be uneven.
+    Where that is unknown, too late is three times the usual step, as times may be uneven.
     """
     counter = [i for i in index if i is not None]
     if len(counter) == len(index):
         return np.diff(np.array(counter, np.int64), prepend=counter[0] - 1) != 1
     steps = np.diff(time_ns, prepend=time_ns[0])
     if period_s is None:
-        return steps > _GAP_STEPS * np.median(steps[1:] if len(steps) > 1 else steps)
+        later = steps[1:] if len(steps) > 1 else steps
+        return steps > _GAP_STEPS * max(np.median(later), np.mean(later))  # the median of bursts is too short
     return steps > _GAP_PERIODS * period_s * NS_PER_S
 
 

@@ -309,7 +309,7 @@ class Decoder(nn.Module):
         """Tokens through all layers, their keys and values written from row t on."""
 
         apart = len(caches) == self.config.num_layers
-        once = before_the_loop if apart else lambda x: x
+        once = before_the_loop if apart else lambda x: x  # for weights of layers, and keys of the prompt as columns
 
         def each(layer: DecoderLayer, x: Any, past: LayerCache, cache: TokenCache, i: Any = None) -> Any:
             q, row = layer.project(x, rotation)

@@ -76,7 +76,7 @@ def load_encoder(path: Path) -> PretrainedEncoder:
             entries = {name.removesuffix(".npy"): _array(archive.read(name)) for name in archive.namelist()}
         about = json.loads(entries.pop(_ABOUT).tobytes()) if _ABOUT in entries else None
     except _BROKEN as error:
-        raise EncoderError(f"encoder is {path}: cannot be read ({error!r}); {fix}") from error
+        raise EncoderError(f"encoder is {path}: cannot be read ({type(error).__name__}: {error}); {fix}") from error
     if about is None:
         raise EncoderError(f"encoder is {path}: it has no entry {_ABOUT!r}; {fix}")
     try:

@@ -35,8 +35,8 @@ class LevelRewards(NamedTuple):
     Attributes:
       ids: token of each level of the asked attribute, −1 past the last one.
       at: place of the level in each completion, T where it states none.
-      reward: r, 0 past the last level.
-      sampled: reward of the completion as it was sampled.
+      reward: r, 0 past the last level and in groups that are left out.
+      sampled: reward of the completion as it was sampled, 0 in groups that are left out.
     """
 
     ids: Int[Array, "P K"]
@@ -85,7 +85,7 @@ def level_rewards(
 
     def with_level(level: tuple[Int[Array, ""], Int[Array, "P"]]) -> Float[Array, "P G"]:
         k, word = level
-        reward = reward_of(jnp.where(here, jnp.maximum(word, 0)[:, None, None], tokens), k)
+        reward = reward_of(jnp.where(here, jnp.maximum(word, 0)[:, None, None], tokens), k).astype(jnp.float32)
         return jnp.where((finite & (word >= 0))[:, None], reward, 0.0)
 
     reward = jnp.moveaxis(jax.lax.map(with_level, (jnp.arange(ids.shape[1]), ids.T)), 0, -1)
@@ -140,15 +140,15 @@ def _norm(
             spread = jnp.sum(p * (reward - mean[..., None]) ** 2, -1) + jnp.maximum(other_words, 0.0)
             spread = jnp.where(states, spread, (sampled - mean) ** 2)
             n = jnp.sqrt(jnp.mean(spread, -1, keepdims=True)) + epsilon
-            return jnp.where(n > 0, n, 1.0)  # at ε = 0, where every level earns 0
+            return jnp.where(n > 0, n, 1.0)  # at ε = 0, where all levels earn the same
         case Norm.MEAN:
             return jnp.maximum(mean, MEAN_FLOOR)
         case _:
             assert_never(norm)
 
 
-def of_kept(parts: Mapping[str, Array], finite: Bool[Array, "P"]) -> dict[str, Array]:
-    """Parts of a loss with the mean E_i over the groups that stay alone; E_i of the others is 0."""
+def expected_of_kept(parts: Mapping[str, Array], finite: Bool[Array, "P"]) -> dict[str, Array]:
+    """Parts of a loss with the mean E_i over the groups that are not left out; E_i of the others is 0."""
     share = jnp.maximum(jnp.mean(finite), 1 / len(finite))
     return {name: x / share if name == "expected_reward" else x for name, x in parts.items()}
 

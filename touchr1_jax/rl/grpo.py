@@ -38,7 +38,7 @@ from touchr1_jax.rl.advantages import (
 )
 from touchr1_jax.rl.config import Average, GRPOConfig, TactileUse, at_precision, ratio_to_learner
 from touchr1_jax.rl.counterfactual import mask_one_stream
-from touchr1_jax.rl.enumerated import LevelRewards, all_equal, level_rewards, of_kept
+from touchr1_jax.rl.enumerated import LevelRewards, all_equal, expected_of_kept, level_rewards
 from touchr1_jax.rl.gradient import Experience, log_probs
 from touchr1_jax.rl.losses import check_centering, over_tokens
 from touchr1_jax.rl.metrics import (
@@ -241,7 +241,7 @@ class GRPOEngine:
         params, opt_state, parts = update_policy(
             self.fns, self.optimizer, self.config, state.params, state.opt_state, reference, learn
         )
-        parts = of_kept(parts, group.finite)
+        parts = expected_of_kept(parts, group.finite)
         metrics |= parts | self.group_metrics(group) | self.answered(group) | self.metrics(group, learn)
         step, behind = state.step + 1, (*state.behind, state.params)[1:]
         after = dataclasses.replace(state, params=params, opt_state=opt_state, step=step, behind=behind)

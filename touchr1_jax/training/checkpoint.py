@@ -238,9 +238,12 @@ class Checkpoints:
 
     def _remove_old(self, keep: int) -> None:
         """Remove what a killed process had not removed, or only in part."""
-        for where in old_checkpoints(self._directory, keep, self._better is not None):
-            if jax.process_index() == 0:
-                shutil.rmtree(where)
+        if jax.process_index() == 0:
+            for where in old_checkpoints(self._directory, keep, self._better is not None):
+                try:
+                    shutil.rmtree(where)
+                except OSError as error:
+                    self._print(f"{where} is old and cannot be removed ({error}): remove it")
         multihost_utils.sync_global_devices("removed old checkpoints")
 
     def _set_aside_unscored(self) -> None:

@@ -43,6 +43,7 @@ def old_checkpoints(directory: Path, keep: int, scored: bool) -> list[Path]:
         return []
     best = json.loads((newest / "data" / "metadata").read_text(encoding="utf-8")).get("best")
     old = set(steps[:-keep]) - {best[0] if best else None}
-    if not old or (scored and not best) or changed_files(newest):
+    lacks_best = best[0] not in steps if best else scored  # then one of the old may be the best that is left
+    if not old or lacks_best or changed_files(newest):
         return []
     return [directory / str(step) for step in sorted(old)]

@@ -42,6 +42,25 @@ def test_a_signal_while_an_extension_loads_is_no_import_error(signalled, raised)
         load_extension(signalled)
 
 
+def test_a_signal_waits_until_an_extension_is_loaded(monkeypatch):
+    """The loader, a function here, is not interrupted; the signal comes again afterwards."""
+    loaded = []
+
+    def load():
+        signal.raise_signal(signal.SIGTERM)
+        time.sleep(3 * AGAIN_S)
+        loaded.append(True)
+
+    def load_and_wait():
+        load()
+        time.sleep(1)
+
+    monkeypatch.setattr("sensors_io.signals._LOADING", {load.__code__})
+    with pytest.raises(Stopped), Stopping().listening():
+        load_and_wait()
+    assert loaded
+
+
 def test_a_closed_terminal_stops_no_run_that_nohup_started():
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:

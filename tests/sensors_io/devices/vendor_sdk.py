@@ -6,15 +6,15 @@ import numpy as np
 
 
 def frames(serial):
-    """Three frames, or as many as the serial says; "fails" raises, no reader takes those of "objects" and "µs"."""
+    """Three frames, or as many as the serial says; "fails" raises, no reader takes "objects", "µs" and "wall"."""
     print("vendor banner on standard output", flush=True)  # noqa: T201
     if serial == "fails":
         raise RuntimeError("no such sensor")
     if serial == "objects":
         yield time.monotonic_ns(), 0, {"a": np.array([None])}
         return
-    if serial == "µs":
-        yield time.monotonic_ns() // 1000, 0, {}
+    if serial in ("µs", "wall"):
+        yield time.monotonic_ns() // 1000 if serial == "µs" else time.time_ns(), 0, {}
         return
     for n in range(int(serial or 3)):
         picture = np.full((2, 3, 3), n, np.uint8)

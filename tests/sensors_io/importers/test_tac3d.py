@@ -104,6 +104,16 @@ def test_receive_times_are_host_times_where_they_are_stored(tmp_path):
     assert back.flags.tolist() == [0, int(Flag.TIME_GAP), int(Flag.TIME_GAP)]  # the last, by its counter
 
 
+@pytest.mark.parametrize(
+    ("received_s", "back"), [((0.0, 0.1, 0.5, 0.3, 0.4, 0.6), (3, 4)), ((0.1, 0.2, 0.3, 0.4, 0.5, 0.0), (5,))]
+)
+def test_every_frame_whose_time_runs_back_is_flagged(tmp_path, received_s, back):
+    arrays = {name: np.repeat(array[:1], 6, axis=0) for name, array in recording().items()}
+    arrays |= {"index": np.arange(6).reshape(arrays["index"].shape), "recvTimestamp": np.array(received_s)}
+    _, store = read(write(tmp_path / "in", **arrays), tmp_path / "out")
+    assert np.flatnonzero(store.contact(0)["tac3d"].flags).tolist() == list(back)
+
+
 @pytest.mark.parametrize("value", [np.nan, 1e7, 1e300])
 def test_a_frame_of_values_that_no_sensor_measures_is_left_out(tmp_path, value):
     arrays = recording()

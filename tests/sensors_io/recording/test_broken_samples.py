@@ -162,14 +162,15 @@ def test_a_sensor_that_is_silent_at_either_end_of_a_contact_is_flagged_and_count
     assert gaps.tolist() == [range(len(made))[n] for n in marked]
 
 
-def test_a_pause_of_a_sensor_whose_rate_is_unknown_is_flagged(tmp_path):
+@pytest.mark.parametrize("late_ms", [lambda n: 7 * n % 10, lambda n: -n % 3 * 9])
+def test_a_pause_of_a_sensor_whose_rate_is_unknown_is_flagged(tmp_path, late_ms):
     class Uncounted(Partly):
-        """Its times are uneven, as those of a network."""
+        """Its times are uneven, as those of a network, or come in bursts of three."""
 
         identity = property(lambda self: Identity(sensor="digit"))
 
         def drain(self):
-            late_ns = (7 * self.count % 10) * MS
+            late_ns = late_ms(self.count) * MS
             return [dataclasses.replace(s, index=None, host_time_ns=s.host_time_ns + late_ns) for s in super().drain()]
 
     hand = Hand()

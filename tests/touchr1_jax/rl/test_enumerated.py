@@ -22,8 +22,8 @@ from touchr1_jax.rl.enumerated import (
     conclude_exactly,
     conclusion_place,
     exact_terms,
+    expected_of_kept,
     level_rewards,
-    of_kept,
 )
 from touchr1_jax.rl.grpo import Group, GRPOEngine, make_grpo_step, start_state
 from touchr1_jax.rl.losses import TokenTerms, grpo_loss
@@ -75,7 +75,7 @@ def test_a_group_that_earns_nothing_has_no_advantage_without_an_epsilon_either()
 
 def test_the_expected_reward_of_a_step_is_of_the_groups_that_stay():
     parts = {"expected_reward": jnp.array(0.2), "loss": jnp.array(0.2)}
-    of = lambda *finite: {name: float(x) for name, x in of_kept(parts, jnp.array(finite)).items()}
+    of = lambda *finite: {name: float(x) for name, x in expected_of_kept(parts, jnp.array(finite)).items()}
     assert of(True, False) == {"expected_reward": pytest.approx(0.4), "loss": pytest.approx(0.2)}
     assert of(True, True) == {"expected_reward": pytest.approx(0.2), "loss": pytest.approx(0.2)}
     assert np.isfinite(of(False, False)["expected_reward"])
@@ -249,17 +249,20 @@ def test_rewards_of_every_conclusion_by_hand(rewards):
 
 
 def test_a_level_that_nobody_said_and_whose_reward_is_nan_costs_its_group():
-    """Two questions; every answer says the first level.  For the second question another level earns NaN."""
+    """Two questions; every answer says the first level.  For the second question another level earns NaN; rewards are
+    of 16 bits, in which the square of 300 is infinite."""
     opens, first = LEVELS.opens, int(LEVELS.level[0][0])
     tokens = jnp.broadcast_to(jnp.array([opens, first]), (2, 2, 2))
     target = tiny.target(np.zeros(2, int), np.array([2, 2]))
-    broken = lambda tokens, level: jnp.where((level == 1) & (jnp.arange(2) == 1)[:, None], jnp.nan, jnp.ones((2, 2)))
+    broken = lambda tokens, level: jnp.where(
+        (level == 1) & (jnp.arange(2) == 1)[:, None], jnp.nan, jnp.full((2, 2), 300, jnp.float16)
+    )
     sampled, counts = jnp.ones((2, 2)), jnp.ones(2, bool)
     found, finite, shares = level_rewards(broken, LEVELS, tokens, target, sampled, counts)
     np.testing.assert_array_equal(finite, [True, False])
     assert shares == {"nonfinite_in_levels": 0.5}
     np.testing.assert_array_equal(found.ids, [LEVELS.level[0]] * 2)
-    np.testing.assert_allclose(found.reward[0, 0, :3], 1)
+    np.testing.assert_allclose(found.reward[0, 0, :3], 300)
     np.testing.assert_allclose(found.reward[1], 0)
     np.testing.assert_allclose(found.sampled, [[1, 1], [0, 0]])
 

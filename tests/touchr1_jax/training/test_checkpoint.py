@@ -14,7 +14,7 @@ import pytest
 
 from tests.touchr1_jax.training.stepping import feed, start, step
 from touchr1_jax.training.checkpoint import CheckpointError, Checkpoints, DamagedCheckpointError, digest
-from touchr1_jax.training.checksums import CHECKSUMS
+from touchr1_jax.training.checksums import CHECKSUMS, old_checkpoints
 
 UNREAD = ("_CHECKPOINT_METADATA", "commit_success.txt")
 """Files that Orbax writes after the checksums; no state depends on them."""
@@ -275,9 +275,19 @@ class TestDamagedBest:
                 assert sorted(path.name for path in stage.iterdir()) == ["2", "3"]
         assert not told
         shutil.copytree(old, stage / "1")
-        (stage / "3" / "data" / "metadata").write_text("{}")
-        with Checkpoints(stage, keep=1, better="higher") as checkpoints:
-            assert (stage / "1").is_dir()
+        with Checkpoints(stage, keep=2, better="higher"):
+            assert sorted(path.name for path in stage.iterdir()) == ["2", "3"]
+
+    @pytest.mark.parametrize("lost", ["the newest is damaged", "the best is gone"])
+    def test_an_old_checkpoint_that_may_be_needed_stays(self, stage, lost):
+        best, newest = sorted(path.name for path in stage.iterdir())
+        shutil.copytree(stage / best, stage / "1")
+        if lost == "the best is gone":
+            (stage / best).rename(stage / "away")
+        else:
+            state = next(path for path in (stage / newest / "state").rglob("*") if path.is_file())
+            state.write_bytes(b"")
+        assert old_checkpoints(stage, 1, True) == []
 
     @pytest.mark.parametrize(("better", "best"), [("higher", 3), ("lower", 4)])
     def test_of_equal_ones_the_newest_is_the_best_however_often_the_run_is_resumed(self, tmp_path, better, best):
