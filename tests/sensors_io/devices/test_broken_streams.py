@@ -12,6 +12,7 @@ from sensors_io.clock import JumpingClock
 from sensors_io.devices import tac3d_messages
 from sensors_io.devices.errors import DeviceDataError, TwoSendersWarning, WrongRateWarning
 from sensors_io.devices.intake import Intake
+from sensors_io.devices.netft import _RateCheck
 from sensors_io.devices.reader import Reader
 from sensors_io.devices.replay import Replay
 from sensors_io.devices.sources import Tac3dRecording
@@ -159,6 +160,13 @@ def test_a_reader_that_was_held_up_does_not_call_the_rate_wrong():
                 time.sleep(0.5 if k == 600 else 0.0004)
             stamps.append(device.read(5.0).device_time_ns)
     assert None not in stamps
+
+
+def test_a_reader_that_waits_no_more_still_sees_that_records_come_too_early():
+    check = _RateCheck(1000.0)
+    for k in range(7000):  # 7,000 a second, waited for in the first .3 s alone
+        check.step(k, k * 10**9 // 7000, waited=k < 2100)
+    assert check.measured_hz == pytest.approx(7000, rel=0.01)
 
 
 def test_a_wrong_rate_of_a_force_sensor_warns_and_leaves_its_stamps_out():
