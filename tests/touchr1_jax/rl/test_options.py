@@ -159,7 +159,8 @@ ON_HALF = dataclasses.replace(FNS, base=HALF, cache_dtype=jnp.dtype(jnp.bfloat16
 def test_a_sampler_that_rounds_otherwise_is_no_kl_in_the_reward(fns, start, bfloat16):
     """The policy is its reference and all answers earn alike: what bfloat16 rounds would be an advantage of .06.
 
-    Also where only the frozen weights under adapters have 16 bits, as those of released models.
+    Also where only the frozen weights under adapters have 16 bits, as those of released models: from these, the sampler
+    of jax 0.12 computes as the learner does.
     """
     config = dataclasses.replace(CONFIG, bfloat16=bfloat16, algorithm=Paper(gamma=0.0, kl_in_reward=True))
     alike = lambda o, t: (jnp.ones(()), {"right": jnp.ones(())}, score(o, t)[2])
@@ -168,7 +169,8 @@ def test_a_sampler_that_rounds_otherwise_is_no_kl_in_the_reward(fns, start, bflo
         start_state(start, OPTIMIZER, jax.random.key(1), config),
     )
     _, metrics = step(state, BATCH, FROZEN._replace(reference=at_precision(config, start)))
-    assert (metrics["sampler_gap"] > 0, metrics["reward_kl"], metrics["advantage_peak"]) == (True, 0, 0)
+    assert metrics["sampler_gap"] > 0 or (not bfloat16 and jax.__version_info__ >= (0, 12))
+    assert (metrics["reward_kl"], metrics["advantage_peak"]) == (0, 0)
 
 
 @pytest.mark.long
