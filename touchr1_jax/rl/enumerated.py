@@ -9,8 +9,8 @@ degenerate.  The tokens before it get the score-function gradient of A_i = (E_i 
 
     NONE 1      STD σ + ε, σ² = mean_i [Σ_k p_ik (r_ik − Ē)² + (1 − Σ_k p_ik) Ē²]      MEAN max(Ē, .02)
 
-so that MEAN follows ∇ log Ē.  Any other word in the place of a level earns nothing.  A completion without a conclusion
-keeps its sampled reward as E_i, and all of its tokens are trace.
+so that MEAN follows ∇ log Ē; a σ below 1e-5 is rounding, and n is 1.  Any other word in the place of a level earns
+nothing.  A completion without a conclusion keeps its sampled reward as E_i, and all of its tokens are trace.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from touchr1_jax.rl.advantages import SPREAD_FLOOR
 from touchr1_jax.rl.config import Norm
 from touchr1_jax.rl.scoring import NONFINITE_IN, squares_fit
 from touchr1_jax.text.template import LevelTokens
@@ -139,8 +140,8 @@ def _norm(
             other_words = (1 - jnp.sum(p, -1)) * mean**2
             spread = jnp.sum(p * (reward - mean[..., None]) ** 2, -1) + jnp.maximum(other_words, 0.0)
             spread = jnp.where(states, spread, (sampled - mean) ** 2)
-            n = jnp.sqrt(jnp.mean(spread, -1, keepdims=True)) + epsilon
-            return jnp.where(n > 0, n, 1.0)  # at ε = 0, where all levels earn the same
+            sigma = jnp.sqrt(jnp.mean(spread, -1, keepdims=True))
+            return jnp.where(sigma < SPREAD_FLOOR, 1.0, sigma + epsilon)  # else rounding alone makes advantages
         case Norm.MEAN:
             return jnp.maximum(mean, MEAN_FLOOR)
         case _:

@@ -68,9 +68,13 @@ def test_a_trace_without_conclusion_keeps_its_sampled_reward():
     )
 
 
-def test_a_group_that_earns_nothing_has_no_advantage_without_an_epsilon_either():
-    found = exact_terms(Norm.STD, jnp.log(PROBABILITY), 0 * REWARD, jnp.ones(2, bool), jnp.zeros(2), epsilon=0.0)
-    np.testing.assert_array_equal([*found.advantage, *found.objective], 0)
+@pytest.mark.parametrize("reward", [0.0, 0.4])
+def test_a_group_that_earns_the_same_has_no_advantage_without_an_epsilon_either(reward):
+    """E_i of equal rewards differ by rounding, which σ of them would make advantages of 2."""
+    log_p = jax.nn.log_softmax(jnp.asarray(np.random.default_rng(0).normal(0, 2, (50, 8, 3)), jnp.float32))
+    states, sampled = jnp.ones((50, 8), bool), jnp.zeros((50, 8))
+    found = exact_terms(Norm.STD, log_p, jnp.full((50, 8, 3), reward), states, sampled, epsilon=0.0)
+    np.testing.assert_allclose(found.advantage, 0, atol=5e-3)
 
 
 def test_the_expected_reward_of_a_step_is_of_the_groups_that_stay():
