@@ -23,7 +23,7 @@ from sensors_io.schema import LEVELS as SCENE_LEVELS
 from sensors_io.touches import describe, families, read_touch, touch_of_scene
 from touchr1_jax.models.description_policy import LANGUAGE, LEVELS
 
-VERSION = 1  # raised when a description changes, so that no cache outlives it
+VERSION = 2  # raised when a description changes, so that no cache outlives it
 SUFFIXES = (".mov", ".mp4", ".avi", ".mkv")  # file names that count as videos in a folder that no table lists
 SceneDescriber = Callable[[SceneConfig], Float[np.ndarray, "n D"]]
 ROWS = ("names", "objects", "label", "x", "rating")  # of `DescribedVideos`, one entry for each video
@@ -143,6 +143,12 @@ def _describe_files(
     skipped = tuple(Skip(name=file.name, reason=str(why)) for file, why in zip(files, reasons, strict=True) if why)
     alike = Counter(p.name for p in files)  # in several folders
     names = np.array([p.name if alike[p.name] == 1 else str(p) for p in files])
+    for skip in skipped:
+        context.print(f"left out: {skip.name} {skip.reason}")
+    which = np.unique(cached["x"][read], axis=0, return_inverse=True)[1].ravel()
+    for same in (read[which == n] for n in np.flatnonzero(np.bincount(which) > 1)):
+        if len(set(objects[same])) > 1:
+            context.print(f"the same video of several objects, left in: {', '.join(names[same])}")
     return DescribedVideos(
         names=names[read],
         objects=objects[read],
