@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from experiments.core import numerics
 from experiments.core.context import Context
 from experiments.recordings.scene_presses import press_pictures
 from sensors_io.errors import MALFORMED, told
@@ -207,6 +208,6 @@ def scene_properties(config: SceneConfig) -> tuple[Float[np.ndarray, "n T"], np.
 def _cached(
     context: Context, name: str, identity: Sequence[object], make: Callable[[], dict[str, np.ndarray]]
 ) -> dict[str, np.ndarray]:
-    """Arrays from a file of the cache that is named by the hash of an identity."""
-    digest = hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:16]
+    """Arrays from a file of the cache that is named by the hash of an identity and of NumPy's and OpenCV's settings."""
+    digest = hashlib.sha256(json.dumps([*identity, numerics.environment()]).encode()).hexdigest()[:16]
     return context.cached_arrays(f"{name}-{digest}", make, compressed=True)

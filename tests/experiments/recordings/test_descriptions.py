@@ -34,11 +34,15 @@ def test_videos_of_one_name_are_told_apart_and_one_that_is_named_twice_counts_on
     assert found.x[:, 0].tolist() == [1, 2, 3]
 
 
-def test_a_video_that_was_recorded_anew_is_described_anew(described, tmp_path):
+def test_a_video_that_was_recorded_anew_or_is_read_by_other_kernels_is_described_anew(described, tmp_path, monkeypatch):
     file = write(tmp_path / "press.mov", "1")
     assert described([file]).x[0, 0] == 1
     os.utime(write(file, "2"), ns=(0, 10**18))  # of the same size
     assert described([file]).x[0, 0] == 2
+    monkeypatch.setattr(descriptions, "describe", lambda touch: np.full(len(families()), 3, np.float32))
+    assert described([file]).x[0, 0] == 2
+    monkeypatch.setenv("OPENCV_IPP", "disabled")
+    assert described([file]).x[0, 0] == 3
 
 
 def test_videos_that_are_left_out_and_copies_are_named_before_anything_is_learned(tmp_path, context):
