@@ -26,7 +26,7 @@ import tyro
 from rich.console import Console
 
 from experiments.core import numerics, runs, watchers
-from experiments.core.artifacts import DamagedFileError, jsonable, make_folder, write_sealed
+from experiments.core.artifacts import DamagedFileError, jsonable, make_folder, require_link, write_sealed
 from experiments.core.commands import PROG, find, print_error, print_lines, run_command
 from experiments.core.context import Context
 from experiments.core.loops import alarm_tables, left_out_tables
@@ -324,6 +324,7 @@ def _directory(experiment: Experiment[Any], command: Any, typed: str) -> tuple[s
     """The run's directory, and whether it is that of an unfinished run."""
     config = jsonable(command.config, where="config")
     home = command.runs_dir / experiment.name
+    require_link(home / runs.LATEST)  # a copy of a folder of runs may have a folder there
     unfinished = None if command.fresh else runs.newest(home, config, finished=False)
     if unfinished is not None:
         numerics.require_same(runs.read_description(unfinished).get("settings"), unfinished)
