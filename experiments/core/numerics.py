@@ -40,6 +40,7 @@ DEFAULTS: Mapping[str, Any] = {
 """Settings of JAX that change results or may, each with its default; they count where they differ from it."""
 
 ENVIRONMENT: Mapping[str, str] = {
+    **{f"{of}_{x}": "" for of in ("DNNL", "ONEDNN") for x in ("CPU_ISA_HINTS", "DEFAULT_FPMATH_MODE", "MAX_CPU_ISA")},
     "GLIBC_TUNABLES": "",
     "LIBTPU_INIT_ARGS": "",
     "NPY_DISABLE_CPU_FEATURES": "",
@@ -50,8 +51,8 @@ ENVIRONMENT: Mapping[str, str] = {
     "OPENCV_CPU_DISABLE": "",
     "OPENCV_IPP": "",
 }
-"""Environment variables that accelerators, NumPy, OpenCV and the C library read, with defaults; they count where they
-differ."""
+"""Environment variables that accelerators, XLA's oneDNN, NumPy, OpenCV and the C library read, with their defaults; they
+count where they differ."""
 
 HARMLESS = ("--xla_force_host_platform_device_count", "--xla_dump", "--xla_hlo_profile")
 """Flags of XLA that change no result."""
