@@ -51,7 +51,7 @@ ENVIRONMENT: Mapping[str, str] = {
     "OPENCV_CPU_DISABLE": "",
     "OPENCV_IPP": "",
 }
-"""Environment variables that accelerators, XLA's oneDNN, NumPy, OpenCV and the C library read, with their defaults; they
+"""Environment variables that accelerators, XLA's oneDNN, NumPy, OpenCV and the C library read, with defaults; they
 count where they differ."""
 
 HARMLESS = ("--xla_force_host_platform_device_count", "--xla_dump", "--xla_hlo_profile")
