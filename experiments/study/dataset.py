@@ -132,8 +132,8 @@ def split_parts(store: RecordStore, grpo_share: float | None, left_out: Sequence
         if not len(rows):
             raise DataError(
                 f"part {name!r} of the data set holds no contact: every part needs one; use more objects, another "
-                f"grpo_share (now {grpo_share}), or splits with objects in train, val and test; {len(left_out)} odd "
-                "ones are left out"
+                f"grpo_share (now {grpo_share}), or splits with objects in train, val and test"
+                + (f"; {len(left_out)} odd ones are left out" if len(left_out) else "")
             )
     return parts
 
