@@ -5,12 +5,13 @@ is switched off again leaves no trace: `without` takes its bit back.
 """
 
 import dataclasses
+import hashlib
 from collections.abc import Mapping
 
 import cv2
 import numpy as np
 
-from sensors_io.schema import Flag, Sequence
+from sensors_io.schema import FRAME_ARRAYS, Flag, Sequence
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -155,16 +156,32 @@ def oddities(sequence: Sequence, config: QualityConfig | None = None) -> tuple[s
         "every frame flagged": bool(sequence.flags.all()),
     }
     if sequence.frames is not None:
-        least, most = int(sequence.frames.min()), int(sequence.frames.max())
-        colour = {0: "black", 255: "white"}.get(most, "of one grey")
-        found["pictures of one pixel"] = sequence.frames.shape[1] * sequence.frames.shape[2] == 1
-        found[f"all pictures {colour}"] = least == most
-        found["no change between pictures"] = (
-            len(sequence) > 1 and least < most and bool((sequence.frames == sequence.frames[:1]).all())
-        )
+        small, even = sequence.frames.shape[1:3] == (1, 1), bool((sequence.frames == sequence.frames[:, :1, :1]).all())
+        colour = {(0,): "black", (255,): "white"}.get(tuple(np.unique(sequence.frames[:, 0, 0])), "of one colour")
+        found["pictures of one pixel"] = small
+        found[f"all pictures {colour}"] = even and not small
+        found["no change between pictures"] = not even and _stands_still(sequence.frames)
     if sequence.depth_mm is not None:
         found["no contact in any frame"] = bool(untouched(sequence.depth_mm, sequence.valid, config).all())
+    fields = [field for field in (sequence.deformation_mm, sequence.depth_mm) if field is not None]
+    found["no change between fields"] = bool(fields) and all(map(_stands_still, fields))
     return tuple(name for name, holds in found.items() if holds)
+
+
+def _stands_still(rows: np.ndarray) -> bool:
+    return len(rows) > 1 and bool((rows == rows[:1]).all())
+
+
+def recorded_digest(recorded: Mapping[str, Sequence]) -> str:
+    """Sixteen digits of the hash of a contact's arrays by sensor but the clock: a copy under another name has them."""
+    digest = hashlib.sha256()
+    for sensor, sequence in sorted(recorded.items()):
+        digest.update(sensor.encode())
+        for name in FRAME_ARRAYS:
+            array = getattr(sequence, name)
+            if array is not None and not name.endswith("time_ns"):
+                digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:16]
 
 
 def without(flags: np.ndarray, *filters: Flag) -> np.ndarray:

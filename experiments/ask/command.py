@@ -24,6 +24,7 @@ from experiments.ask.page import write_page
 from experiments.core.artifacts import DamagedFileError, make_folder
 from experiments.core.commands import PROG, print_error, print_lines
 from experiments.core.errors import DataError
+from experiments.core.memory import require_memory
 from experiments.core.runner import COMPILED
 from experiments.study.policies import find_policy, is_policy, measured_figures
 from sensors_io.commands.values import require_possible
@@ -32,6 +33,7 @@ from sensors_io.records import RecordStore
 from sensors_io.remote import Mirror, at_url
 from sensors_io.scenes.backend import require_backend
 from touchr1_jax.asking import HUB, AskablePolicy, push
+from touchr1_jax.distributed.processes import MachineError
 from touchr1_jax.models.adapted_folder import export_merged
 from touchr1_jax.models.load import WeightsError
 from touchr1_jax.models.qwen.config import CONFIG_FILE
@@ -41,7 +43,7 @@ from touchr1_jax.text.plain_questions import QuestionError
 from touchr1_jax.training.compilation import compilations_kept
 from touchr1_jax.training.questions import NoLabelsError
 
-FAILURES = (UserError, WeightsError, QuestionError, NoLabelsError, DamagedFileError, OSError)
+FAILURES = (UserError, WeightsError, QuestionError, NoLabelsError, DamagedFileError, MachineError, OSError)
 """Errors whose message is all that a user needs."""
 
 
@@ -234,6 +236,7 @@ def run_asking(arguments: Sequence[str]) -> int:
     compiled, exports = command.cache_dir / COMPILED, arguments[0] == "export"
     try:
         if not exports:
+            require_memory({})
             make_folder(compiled, "cache-dir", command.cache_dir)
         with contextlib.nullcontext() if exports else compilations_kept(compiled):
             require_backend()

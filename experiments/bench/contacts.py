@@ -1,14 +1,12 @@
 """The bridge from records to the bench: contacts measured by every sensor, with a fingerprint of their recordings."""
 
 import collections
-import hashlib
-from collections.abc import Callable, Mapping
-
-import numpy as np
+from collections.abc import Callable
 
 from sensors_io.measures import Measured, MeasureError, measure
+from sensors_io.quality import recorded_digest
 from sensors_io.records import RecordStore
-from sensors_io.schema import FRAME_ARRAYS, UNKNOWN, Sequence
+from sensors_io.schema import UNKNOWN
 from touchr1_jax.bench.items import Touch
 from touchr1_jax.bench.questions.contacts import ContactError, MeasuredContact, SplitContacts
 from touchr1_jax.bench.questions.generate import BenchSource
@@ -44,20 +42,8 @@ def measure_split(store: RecordStore, split: str, after_each: Callable[[], None]
                     labels={name: level for name, level in card.labels.items() if level != UNKNOWN},
                     deceptive=card.visual_lies,
                     measured=measured,
-                    fingerprint=_fingerprint(recorded),
+                    fingerprint=recorded_digest(recorded),
                 )
             )
         after_each()
     return SplitContacts(contacts=tuple(contacts), skipped=dict(skipped))
-
-
-def _fingerprint(recorded: Mapping[str, Sequence]) -> str:
-    """Hash of all recorded arrays but the clock: a copy under another name has the same."""
-    digest = hashlib.sha256()
-    for sensor, sequence in sorted(recorded.items()):
-        digest.update(sensor.encode())
-        for name in FRAME_ARRAYS:
-            array = getattr(sequence, name)
-            if array is not None and not name.endswith("time_ns"):
-                digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()[:16]

@@ -147,10 +147,15 @@ def read_times(path: Path) -> dict[str, float]:
         return {name: float(seconds) for name, seconds in found.items()}
 
 
-def point_link(link: Path, target: str) -> None:
-    """Make `link` a symbolic link to `target`, replacing an older link, and nothing else, atomically."""
+def require_link(link: Path) -> None:
+    """`FileExistsError` if something that is no symbolic link, such as a copy of its target, is in its place."""
     if link.exists() and not link.is_symlink():
         raise FileExistsError(f"{link} is no symbolic link, so it is not replaced; move it away")
+
+
+def point_link(link: Path, target: str) -> None:
+    """Make `link` a symbolic link to `target`, replacing an older link, and nothing else, atomically."""
+    require_link(link)
     temporary = link.with_name(f".{link.name}.{os.getpid()}")
     temporary.unlink(missing_ok=True)
     temporary.symlink_to(target)

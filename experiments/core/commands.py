@@ -227,7 +227,7 @@ def _listing_of_runs(name: str, question: str, runs_dir: Path) -> list[str]:
 
 
 def _past_runs(home: Path) -> tuple[list[runs.PastRun], list[str]]:
-    """The readable runs under `runs/NAME`, the newest first, and the errors of the others."""
+    """The readable runs under `runs/NAME`, the newest first, and what is wrong with the others."""
     past, damaged = [], []
     try:
         begun = runs.started(home)
@@ -235,7 +235,11 @@ def _past_runs(home: Path) -> tuple[list[runs.PastRun], list[str]]:
         return [], [_unread(error)]
     for directory in begun:
         try:
-            past.append(runs.read_run(directory))
+            run = runs.read_run(directory)
+            if run.name == home.name:
+                past.append(run)
+            else:
+                damaged.append(f"{directory} is a run of {run.name}: move it to {home.with_name(run.name)}")
         except DamagedFileError as error:
             damaged.append(str(error))
         except OSError as error:

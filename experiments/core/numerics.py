@@ -1,4 +1,4 @@
-"""Settings that the bits of a result depend on besides configuration and code: JAX, XLA, NumPy, device, processor.
+"""Settings that the bits of a result depend on besides configuration and code: JAX, XLA, NumPy, OpenCV, device, CPU.
 
 Cores, threads and thread pools change no bit: `experiments.__main__` gives NumPy's linear algebra one thread, for more
 would add in another order.  The number of devices does change bits; the cache of policies counts the mesh.
@@ -40,13 +40,19 @@ DEFAULTS: Mapping[str, Any] = {
 """Settings of JAX that change results or may, each with its default; they count where they differ from it."""
 
 ENVIRONMENT: Mapping[str, str] = {
+    **{f"{of}_{x}": "" for of in ("DNNL", "ONEDNN") for x in ("CPU_ISA_HINTS", "DEFAULT_FPMATH_MODE", "MAX_CPU_ISA")},
+    "GLIBC_TUNABLES": "",
     "LIBTPU_INIT_ARGS": "",
     "NPY_DISABLE_CPU_FEATURES": "",
+    "NPY_ENABLE_CPU_FEATURES": "",
     "NVIDIA_TF32_OVERRIDE": "",
     "OPENBLAS_CORETYPE": "",
     "OPENBLAS_NUM_THREADS": "1",
+    "OPENCV_CPU_DISABLE": "",
+    "OPENCV_IPP": "",
 }
-"""Environment variables that accelerators and NumPy read, each with its default; they count where they differ."""
+"""Environment variables that accelerators, XLA's oneDNN, NumPy, OpenCV and the C library read, with defaults; they
+count where they differ."""
 
 HARMLESS = ("--xla_force_host_platform_device_count", "--xla_dump", "--xla_hlo_profile")
 """Flags of XLA that change no result."""
@@ -68,9 +74,12 @@ def settings() -> dict[str, Any]:
     found = {name: jax.config.values[name] for name in SETTINGS} | {FLAGS: flags}
     now = {name: jax.config.values.get(name, default) for name, default in DEFAULTS.items()}
     found |= {name: value for name, value in now.items() if value != DEFAULTS[name]}
-    return found | {
-        name: os.environ[name] for name, usual in ENVIRONMENT.items() if os.environ.get(name, usual) != usual
-    }
+    return found | environment()
+
+
+def environment() -> dict[str, str]:
+    """The variables of `ENVIRONMENT` that differ from their defaults."""
+    return {name: os.environ[name] for name, usual in ENVIRONMENT.items() if os.environ.get(name, usual) != usual}
 
 
 def require_same(before: Mapping[str, Any] | None, where: object) -> None:

@@ -26,7 +26,7 @@ import tyro
 from rich.console import Console
 
 from experiments.core import numerics, runs, watchers
-from experiments.core.artifacts import DamagedFileError, jsonable, make_folder, write_sealed
+from experiments.core.artifacts import DamagedFileError, jsonable, make_folder, require_link, write_sealed
 from experiments.core.commands import PROG, find, print_error, print_lines, run_command
 from experiments.core.context import Context
 from experiments.core.loops import alarm_tables, left_out_tables
@@ -297,12 +297,18 @@ def _execute(experiment: Experiment[Any], command: Any, about: str, typed: str) 
         make_folder(command.cache_dir / COMPILED, "cache-dir", command.cache_dir)
         processes = join_processes(command.launch)
         common = {"experiment": experiment.name, "config": jsonable(command.config), "code": runs.code_digest()}
-        common |= {"versions": runs.versions(), "settings": numerics.settings(), "mesh": jsonable(command.launch.mesh)}
+        common |= {"processes": processes.count, "versions": runs.versions()}
+        common |= {"settings": numerics.settings(), "mesh": jsonable(command.launch.mesh)}
         with watched(processes.count, processes.index, common, fate):
             require_backend()
             require_accelerators(command.scale, experiment.needs.get(command.scale))
             chosen, resumed = processes.broadcast(lambda: _directory(experiment, command, typed))
             directory = Path(chosen)
+            if not (directory / "config.json").exists():  # in another working directory, or on a disk of its own
+                raise DifferentProcessesError(
+                    f"process {processes.index} does not see {directory.absolute()}, the run of process 0: all must "
+                    "share runs-dir and cache-dir; give the whole path of a shared folder to each"
+                )
             lock = runs.locked(directory) if processes.writes else contextlib.nullcontext()
             with stopping.listening(), lock, compilations_kept(command.cache_dir / COMPILED):
                 if processes.writes:
@@ -324,6 +330,7 @@ def _directory(experiment: Experiment[Any], command: Any, typed: str) -> tuple[s
     """The run's directory, and whether it is that of an unfinished run."""
     config = jsonable(command.config, where="config")
     home = command.runs_dir / experiment.name
+    require_link(home / runs.LATEST)  # a copy of a folder of runs may have a folder there
     unfinished = None if command.fresh else runs.newest(home, config, finished=False)
     if unfinished is not None:
         numerics.require_same(runs.read_description(unfinished).get("settings"), unfinished)

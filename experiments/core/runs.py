@@ -38,6 +38,7 @@ PACKAGES = ("touchr1-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint",
 FIELDS = frozenset({"experiment", "scale", "config", "git", "command"})
 """Fields in `config.json` of a run; that of a model has others."""
 
+LATEST = "latest"  # link to the newest run that computes, beside the runs
 UNKNOWN = "unknown"  # commit of code outside a checkout
 ROOT = Path(__file__).resolve().parents[2]  # the checkout of this code, if there is one
 
@@ -129,7 +130,7 @@ def describe(
 
 def point_latest(directory: Path) -> None:
     """Let `runs/NAME/latest` point to a run."""
-    point_link(directory.parent / "latest", directory.name)
+    point_link(directory.parent / LATEST, directory.name)
 
 
 @contextlib.contextmanager
@@ -177,9 +178,10 @@ def is_finished(directory: Path) -> bool:
 
 
 def newest(home: Path, config: Any, *, finished: bool) -> Path | None:
-    """The newest finished, or unfinished, run under `runs/NAME` with this configuration in JSON's types, or `None`."""
+    """The newest finished, or unfinished, run of NAME under `runs/NAME` with this configuration in JSON's types."""
     of_kind = (run for run in started(home) if is_finished(run) == finished)
-    return next((run for run in of_kind if read_description(run)["config"] == config), None)
+    about = lambda run: [read_description(run)[name] for name in ("experiment", "config")]
+    return next((run for run in of_kind if about(run) == [home.name, config]), None)
 
 
 def read_description(directory: Path) -> dict[str, Any]:
@@ -300,7 +302,7 @@ def _in_use(directory: Path) -> bool:
 
 def locate(name: str, runs_dir: Path) -> Path:
     """Directory of a run by `NAME/STAMP`, `NAME` for the latest, or its path; `FileNotFoundError` without one."""
-    for directory in (runs_dir / name, runs_dir / name / "latest", Path(name), Path(name) / "latest"):
+    for directory in (runs_dir / name, runs_dir / name / LATEST, Path(name), Path(name) / LATEST):
         if (directory / "config.json").exists():
             return directory.resolve()
     raise FileNotFoundError(

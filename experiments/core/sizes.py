@@ -39,8 +39,8 @@ def require_sizes(config: Any, scales: Collection[Any]) -> None:
             raise ValueError(f"{path} is {value}: must be 0 or at least {LEAST_FLOAT:g}; raise it")
         if least is not None and least >= 0 and any(x < 0 for x in numbers):
             raise ValueError(f"{path} is {value}: must be at least 0; raise it")
-        counts = isinstance(value, int) and least is not None and least >= 1 and not path.endswith("seed")
-        if counts and value < 1 and _is_unchecked(owner, path):
+        counts = least is not None and least >= 1 and not path.endswith("seeds" if isinstance(value, tuple) else "seed")
+        if counts and any(isinstance(x, int) and x < 1 for x in numbers) and _is_unchecked(owner, path, value):
             raise ValueError(f"{path} is {value}: must be at least 1; raise it")
 
 
@@ -61,10 +61,11 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _is_unchecked(owner: Any, path: str) -> bool:
+def _is_unchecked(owner: Any, path: str, value: Any) -> bool:
     """True if a class accepts −1, which is no count: then it does not check the field."""
+    wrong = (-1,) * len(value) if isinstance(value, tuple) else -1
     try:
-        dataclasses.replace(owner, **{path.rpartition(".")[2]: -1})
+        dataclasses.replace(owner, **{path.rpartition(".")[2]: wrong})
     except (ValueError, TypeError):
         return False
     return True

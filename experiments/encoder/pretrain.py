@@ -13,8 +13,8 @@ import numpy as np
 
 from experiments.core.context import Context
 from experiments.core.loops import run_loop
-from experiments.study.dataset import Dataset, open_dataset, require_same_records
-from experiments.study.sources import SourceConfig, prepare_records
+from experiments.study.dataset import Dataset
+from experiments.study.sources import SourceConfig, open_source
 from sensors_io.pipeline import ClipConfig, ClipMemory, Contacts, clip_batches
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import ATTRIBUTES, Flag
@@ -56,9 +56,7 @@ def open_touch(
 ) -> Dataset:
     """The records, made first if the cache lacks them; frames past the strain limit stay in, as in the studies."""
     clip = ClipConfig(frames=frames, image_px=image_px, rejected=(Flag.NOT_CONVERGED, Flag.SATURATED))
-    data = open_dataset(prepare_records(config, context), clip, 0.5, memory_gib)
-    require_same_records(data, context)
-    return data
+    return open_source(config, clip, 0.5, context, memory_gib=memory_gib)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from experiments.core import numerics
 from experiments.core.context import Context
 from experiments.recordings.scene_presses import press_pictures
 from sensors_io.errors import MALFORMED, told
@@ -23,7 +24,7 @@ from sensors_io.schema import LEVELS as SCENE_LEVELS
 from sensors_io.touches import describe, families, read_touch, touch_of_scene
 from touchr1_jax.models.description_policy import LANGUAGE, LEVELS
 
-VERSION = 1  # raised when a description changes, so that no cache outlives it
+VERSION = 2  # raised when a description changes, so that no cache outlives it
 SUFFIXES = (".mov", ".mp4", ".avi", ".mkv")  # file names that count as videos in a folder that no table lists
 SceneDescriber = Callable[[SceneConfig], Float[np.ndarray, "n D"]]
 ROWS = ("names", "objects", "label", "x", "rating")  # of `DescribedVideos`, one entry for each video
@@ -143,6 +144,12 @@ def _describe_files(
     skipped = tuple(Skip(name=file.name, reason=str(why)) for file, why in zip(files, reasons, strict=True) if why)
     alike = Counter(p.name for p in files)  # in several folders
     names = np.array([p.name if alike[p.name] == 1 else str(p) for p in files])
+    for skip in skipped:
+        context.print(f"left out: {skip.name} {skip.reason}")
+    which = np.unique(cached["x"][read], axis=0, return_inverse=True)[1].ravel()
+    for same in (read[which == n] for n in np.flatnonzero(np.bincount(which) > 1)):
+        if len(set(objects[same])) > 1:
+            context.print(f"the same video of several objects, left in: {', '.join(names[same])}")
     return DescribedVideos(
         names=names[read],
         objects=objects[read],
@@ -201,6 +208,6 @@ def scene_properties(config: SceneConfig) -> tuple[Float[np.ndarray, "n T"], np.
 def _cached(
     context: Context, name: str, identity: Sequence[object], make: Callable[[], dict[str, np.ndarray]]
 ) -> dict[str, np.ndarray]:
-    """Arrays from a file of the cache that is named by the hash of an identity."""
-    digest = hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:16]
+    """Arrays from a file of the cache that is named by the hash of an identity and of NumPy's and OpenCV's settings."""
+    digest = hashlib.sha256(json.dumps([*identity, numerics.environment()]).encode()).hexdigest()[:16]
     return context.cached_arrays(f"{name}-{digest}", make, compressed=True)

@@ -52,7 +52,7 @@ from experiments.recordings.descriptions import (
     describe_source,
     videos_of,
 )
-from experiments.recordings.learning import LearnConfig, answer_log_probs, identity, learn, load, save
+from experiments.recordings.learning import LearnConfig, TrainedEnsemble, answer_log_probs, identity, learn, load, save
 from sensors_io.scenes.config import SceneConfig
 from touchr1_jax.bench.statistics import Interval
 from touchr1_jax.models.description_policy import LANGUAGE, choose, description_policy
@@ -85,7 +85,7 @@ class PhysiclearStudy:
     """A folder of videos to answer for one by one, or videos of one object, instead of validating."""
     out: Path | None = None  # where the answers go, as JSON
     policy: Path | None = None
-    """The trained policy; by default that in the cache, which is trained first where data_dir is given."""
+    """The trained policy; by default that of data_dir, which is trained first, or without data_dir the cache's last."""
     objects: int | None = None  # labelled objects to use; all by default
     frames: int = 8  # frames in contact that are described of each video
     folds: int = 10
@@ -102,8 +102,11 @@ class PhysiclearStudy:
 
 def run(config: PhysiclearStudy, context: Context) -> Results:
     """Validate and train, or predict; `ConfigurationError` without data_dir, or with a part of a prediction."""
-    if config.policy is not None and not config.predict:
-        raise ConfigurationError(f"policy is {config.policy}: is read by --predict alone; leave it out, or name videos")
+    if config.policy is not None and (not config.predict or config.data_dir is not None):
+        raise ConfigurationError(
+            f"policy is {config.policy}: is read by --predict alone, in the place of data_dir ({config.data_dir}), on "
+            "which another is trained; leave one of them out, or name videos"
+        )
     if bool(config.predict) != (config.out is not None):
         named = " ".join(map(str, config.predict)) or None
         raise ConfigurationError(f"predict is {named}, out {config.out}: give both to predict, or neither")
@@ -116,12 +119,10 @@ def run(config: PhysiclearStudy, context: Context) -> Results:
 
 def predict(config: PhysiclearStudy, out: Path, context: Context) -> Results:
     """Answer for videos with a trained policy; several that are named one by one are also answered together."""
-    path = config.policy or cached_policy(config, context)
-    if config.data_dir is not None and not path.exists():
-        every = describe_source(config.data_dir, config.frames, context, config.objects)
-        auxiliary = auxiliary_data(config.scenes, config.scene_sets, every, context)
-        train_policy(config, every.labelled(), auxiliary, context)
-    trained = load(path, config.learn)
+    if config.data_dir is None:
+        trained = load(config.policy or cached_policy(config, context), config.learn)
+    else:
+        trained = policy_of(config, config.data_dir, context)
     videos = describe_files(videos_of(config.predict), config.frames, context)
     found = answer_log_probs(trained, videos)
     answers = {str(name): in_words(row) for name, row in zip(videos.names, found, strict=True)}
@@ -135,6 +136,22 @@ def predict(config: PhysiclearStudy, out: Path, context: Context) -> Results:
         tables=(named_table("Answers", rows),),
         settings={"objects learned from": len(np.unique(trained.training.objects))},
     )
+
+
+def policy_of(config: PhysiclearStudy, data_dir: Path, context: Context) -> TrainedEnsemble:
+    """The policy of the cache if it was trained on these videos and scenes, else one that is trained now."""
+    every = describe_source(data_dir, config.frames, context, config.objects)
+    videos, auxiliary = every.labelled(), auxiliary_data(config.scenes, config.scene_sets, every, context)
+    path = cached_policy(config, context)
+    if path.exists():
+        kept = load(path, config.learn)
+        pairs = [(getattr(kept.training, name), getattr(videos, name)) for name in ("objects", "label", "x")]
+        pairs += [(getattr(kept.auxiliary, name), value) for name, value in vars(auxiliary).items()]
+        if all(np.array_equal(a, b) for a, b in pairs):
+            return kept
+        context.print(f"{path} was trained on other videos or scenes, and is made again")
+    train_policy(config, videos, auxiliary, context)
+    return load(context.directory / POLICY, config.learn)
 
 
 def in_words(log_prob: np.ndarray) -> dict[str, object]:

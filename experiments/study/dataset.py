@@ -4,7 +4,7 @@ import dataclasses
 import hashlib
 import json
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +57,16 @@ class Dataset:
     def labels(self, part: str) -> np.ndarray:
         """Labels of the contacts of a part, int32 [n, A]."""
         return self.label[self.parts[part]]
+
+    def levels(self) -> Iterator[str]:
+        """For each attribute the number of objects of each level in each part: 0 is not learned, or not asked."""
+        for a, name in enumerate(ATTRIBUTES):
+            counts = []
+            for part, rows in {"training": self.training, **{p: self.parts[p] for p in ("val", "test")}}.items():
+                level = self.label[rows[np.unique(self.object_ids[rows], return_index=True)[1]], a]
+                of_part = np.bincount(level[level >= 0], minlength=LEVELS[name])
+                counts.append(f"{part} {', '.join(map(str, of_part))}")
+            yield f"{name}, objects of levels 0 to {LEVELS[name] - 1}: {'; '.join(counts)}"
 
     def prior(self) -> np.ndarray:
         """Frequency of each level among the labels of training contacts, float32 [A, K]; padding levels have 0.
@@ -123,6 +133,7 @@ def split_parts(store: RecordStore, grpo_share: float | None, left_out: Sequence
             raise DataError(
                 f"part {name!r} of the data set holds no contact: every part needs one; use more objects, another "
                 f"grpo_share (now {grpo_share}), or splits with objects in train, val and test"
+                + (f"; {len(left_out)} odd ones are left out" if len(left_out) else "")
             )
     return parts
 

@@ -5,18 +5,24 @@ import functools
 import hashlib
 import json
 import time
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from experiments.core.context import Context
 from experiments.core.progress import ProgressCallback
+from experiments.study.dataset import Dataset, open_dataset, require_same_records
 from sensors_io.generate import generate_records
 from sensors_io.importers.physiclear import PhysiclearConfig, import_physiclear
 from sensors_io.locks import RecordsBusyError
-from sensors_io.quality import oddities
+from sensors_io.pipeline import ClipConfig
+from sensors_io.quality import oddities, recorded_digest
 from sensors_io.records import RecordStore
 from sensors_io.scenes.config import SceneConfig, config_hash
+from sensors_io.schema import Sequence
 
 Source = Literal["generated", "physiclear", "records"]
 
@@ -62,23 +68,64 @@ def prepare_records(config: SourceConfig, context: Context) -> Path:
     return path
 
 
+def open_source(
+    config: SourceConfig,
+    clip: ClipConfig,
+    grpo_share: float | None,
+    context: Context,
+    *,
+    memory_gib: float = 0.0,
+    threads: int = 1,
+) -> Dataset:
+    """The records, of recordings without odd contacts if these are dropped; other arguments as of `open_dataset`.
+
+    `ConfigurationError` if they are others than the run began with.
+    """
+    path = prepare_records(config, context)
+    odd = odd_contacts(config, path, context)
+    data = open_dataset(path, clip, grpo_share, memory_gib, threads, odd if config.drop_odd else ())
+    require_same_records(data, context)
+    for line in data.levels() if config.data != "generated" else ():
+        context.print(line)
+    return data
+
+
 def odd_contacts(config: SourceConfig, path: Path, context: Context) -> tuple[int, ...]:
     """Contacts of recordings of which a sequence teaches nothing about touch, printed by reason; none of scenes."""
     if config.data == "generated":
         return ()
     store, reasons = RecordStore(path), dict[str, dict[int, str]]()
+    first, films = dict[str, int](), dict[str, Counter[str]]()
     for i in context.each("looking for odd contacts", range(len(store))):
-        for sequence in store.contact(i).values():
+        contact = store.contact(i)
+        for sensor, sequence in contact.items():
+            films.setdefault(sensor, Counter())[_film(sequence)] += 1
             for reason in oddities(sequence):
                 reasons.setdefault(reason, {})[i] = sequence.name
-    what = "are left out" if config.drop_odd else "are trained on (--drop-odd leaves them out)"
+        twins = {n: store.contacts[n].object_id for n in (first.setdefault(recorded_digest(contact), i), i)}
+        if len(set(twins.values())) > 1:
+            reasons.setdefault("the same recording as of another object", {}).update(twins)
+    for sensor, kinds in films.items():
+        context.print(f"{sensor}: {_listed([f'{n} of {kind}' for kind, n in kinds.most_common()])}")
+    what = "are left out" if config.drop_odd else "are trained on (option drop-odd leaves them out)"
     for reason, named in sorted(reasons.items()):
-        names = ", ".join([*named.values()][:MOST_NAMED]) + (" …" if len(named) > MOST_NAMED else "")
-        context.print(f"{reason}: {len(named)} of {len(store)} contacts {what}: {names}")
+        context.print(f"{reason}: {len(named)} of {len(store)} contacts {what}: {_listed([*named.values()])}")
     untouched = sorted(store.objects.keys() - {key.object_id for key in store.contacts})
     if untouched:
         context.print(f"without any contact: {len(untouched)} of {len(store.objects)} objects, such as {untouched[0]}")
     return tuple(sorted({i for rows in reasons.values() for i in rows}))
+
+
+def _listed(words: list[str]) -> str:
+    return ", ".join(words[:MOST_NAMED]) + (" …" if len(words) > MOST_NAMED else "")
+
+
+def _film(sequence: Sequence) -> str:
+    """Size of its pictures, or of its fields, and its rate in whole frames a second."""
+    shown = next(x for x in (sequence.frames, sequence.depth_mm, sequence.deformation_mm) if x is not None)
+    rows, columns = shown.shape[1:3]
+    spent_s = 1e-9 * float(np.ptp(sequence.host_time_ns))
+    return f"{rows} × {columns}" + (f" at {(len(sequence) - 1) / spent_s:.0f}/s" if spent_s else "")
 
 
 def _after_others(make: Callable[[], object], context: Context) -> object:

@@ -11,8 +11,8 @@ from experiments.core.concurrency import SEED_BYTES
 from experiments.core.context import Context
 from experiments.core.errors import DataError
 from experiments.core.memory import require_memory
-from experiments.study.dataset import Dataset, open_dataset, require_same_records
-from experiments.study.sources import SourceConfig, odd_contacts, prepare_records
+from experiments.study.dataset import Dataset
+from experiments.study.sources import SourceConfig, open_source
 from experiments.study.stages import StudySFT
 from sensors_io.pipeline import ClipConfig
 from sensors_io.scenes.config import SceneConfig
@@ -182,17 +182,13 @@ def open_data(config: TrainingConfig, view_px: int, context: Context, at_once: i
     parts = {"clips at most": round(config.clip_memory_gib * GIB)}
     more = {f"{at_once} seeds at a time": (at_once - 1) * SEED_BYTES} if at_once > 1 else {}
     context.print(require_memory(parts | more))
-    path = prepare_records(config, context)
-    odd = odd_contacts(config, path, context)
-    left_out = odd if config.drop_odd else ()
-    grpo_share = GRPO_SHARE if config.recipe == "paper" else None
-    data = open_dataset(path, clip, grpo_share, config.clip_memory_gib, config.read_threads, left_out)
-    require_same_records(data, context)
+    grpo_share, memory_gib = GRPO_SHARE if config.recipe == "paper" else None, config.clip_memory_gib
+    data = open_source(config, clip, grpo_share, context, memory_gib=memory_gib, threads=config.read_threads)
     known = [sensor.name for sensor in TOUCH_LANGUAGE.sensors]
     if unknown := [name for name in data.clip.sensors if name not in known]:
         raise DataError(
-            f"{path} holds records of {', '.join(unknown)}: answers name {', '.join(known)}; import the records under "
-            "one of these names, or add the sensor to `touchr1_jax.text.language`"
+            f"{data.store.path} holds records of {', '.join(unknown)}: answers name {', '.join(known)}; import the "
+            "records under one of these names, or add the sensor to `touchr1_jax.text.language`"
         )
     return data
 

@@ -35,6 +35,7 @@ PRESSES_BY_ONE_SENSOR = {"motions": ("press",), "forces_n": (2.0,), "sensors": (
         ("active.contacts.ContactsConfig", {"picture_px": 25}, "picture_px"),
         ("active.contacts.ContactsConfig", PRESSES_BY_ONE_SENSOR, "nothing to choose"),
         *(("active.videos.StoppingConfig", {field: 1}, field) for field in ("videos", "folds", "warm_share")),
+        ("bench.dataset_card.DatasetCardConfig", {"drop_odd": True}, "drop_odd is True"),
         ("bench.paper_audit.PaperAuditConfig", {"vtv_items": 0}, "vtv_items is 0"),
         ("encoder.stage_one.StageOneConfig", {"labelled": (30, 10)}, "labelled"),
         ("encoder.stage_one.StageOneConfig", {"labelled": ()}, "labelled"),

@@ -58,12 +58,13 @@ def test_odd_but_legal_sequences_are_named() -> None:
         (): {},
         ("all pictures black",): {"frames": np.zeros_like(pictures)},
         ("all pictures white",): {"frames": np.full_like(pictures, 255)},
-        ("all pictures of one grey",): {"frames": np.full_like(pictures, 7)},
+        ("all pictures of one colour",): {"frames": np.zeros_like(pictures) + pictures[:, :1, :1]},
         ("no change between pictures",): {"frames": np.repeat(pictures[:1], 3, 0)},
         ("pictures of one pixel",): {"frames": pictures[:, :1, :1]},
         ("times that run backwards",): {"host_time_ns": time[::-1].copy()},
         ("every frame flagged",): {"flags": flags + 4},
-        ("no contact in any frame",): {"depth_mm": np.zeros((3, 4, 4), np.float32)},
+        ("no contact in any frame", "no change between fields"): {"depth_mm": np.zeros((3, 4, 4), np.float32)},
+        ("no change between fields",): {"frames": None, "deformation_mm": np.ones((3, 4, 4, 2), np.float32)},
     }
     for expected, changes in cases.items():
         assert quality.oddities(dataclasses.replace(whole, **changes)) == expected

@@ -4,6 +4,8 @@ import resource
 
 import pytest
 
+from experiments.ask.command import run_asking
+from experiments.core import memory
 from experiments.core.memory import free_bytes, require_memory
 from touchr1_jax.distributed.processes import GIB, MachineError
 
@@ -28,3 +30,12 @@ def test_a_limit_that_would_abort_the_compiler_is_refused(limited):
     limited(2 * GIB)
     with pytest.raises(MachineError, match=r"limited to 2 GiB: must be at least 3\.. GiB .*ulimit"):
         require_memory({"clips": GIB})
+
+
+@pytest.mark.parametrize("words", [["ask", "generated"], ["demo", "--no-open", "--port", "0"]])
+def test_a_policy_is_not_asked_where_its_compilation_would_abort(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(memory.resource, "getrlimit", lambda _: (2 * GIB, 2 * GIB))
+    assert run_asking([*words, "--cache-dir", str(tmp_path)]) == 1
+    assert capsys.readouterr().err.startswith(
+        "MachineError: the address space is limited to 2 GiB: must be at least 2."
+    )

@@ -42,6 +42,12 @@ def test_flags_in_a_file_and_variables_of_accelerators_are_settings(monkeypatch,
     for name, value in (
         ("NVIDIA_TF32_OVERRIDE", "1"),
         ("NPY_DISABLE_CPU_FEATURES", "AVX512_SKX"),
+        ("NPY_ENABLE_CPU_FEATURES", "AVX2"),
+        ("ONEDNN_MAX_CPU_ISA", "AVX2"),
+        ("DNNL_DEFAULT_FPMATH_MODE", "BF16"),
+        ("GLIBC_TUNABLES", "glibc.cpu.hwcaps=-AVX2,-FMA"),
+        ("OPENCV_CPU_DISABLE", "AVX2"),
+        ("OPENCV_IPP", "disabled"),
         ("OPENBLAS_CORETYPE", "Haswell"),
         ("OPENBLAS_NUM_THREADS", "2"),
     ):

@@ -128,6 +128,11 @@ def test_only_a_run_that_computes_becomes_the_latest(capsys):
     assert "correct it" in capsys.readouterr().err
     assert len(directories()) == 2
     assert Path("runs/coin/latest").resolve() == latest
+    Path("runs/coin/latest").unlink()
+    latest.rename("runs/coin/latest")  # a copy of a folder of runs that follows links
+    assert run("coin", "--steps", "2") == 1
+    assert "runs/coin/latest is no symbolic link, so it is not replaced; move it away" in capsys.readouterr().err
+    assert len(directories()) == 2
 
 
 def test_a_run_directory_serves_one_process_at_a_time(monkeypatch, capsys):

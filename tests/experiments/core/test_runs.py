@@ -59,6 +59,9 @@ def test_runs_of_one_second_get_their_own_directories(tmp_path, monkeypatch):
     assert runs.newest(tmp_path / "coin", {}, finished=False) == sorted(made)[1]
     assert runs.newest(tmp_path / "coin", {"a": 1}, finished=False) is None
     assert runs.newest(tmp_path / "none", {}, finished=False) is None
+    (tmp_path / "coin").rename(tmp_path / "die")  # its configuration may have the same fields
+    assert runs.newest(tmp_path / "die", {}, finished=True) is None
+    (tmp_path / "die").rename(tmp_path / "coin")
     with pytest.raises(UnwrittenError, match=r"runs-dir is .*results\.json: must be a folder .* name another"):
         runs.create(max(made) / "results.json" / "coin", description)
     monkeypatch.setattr(runs.datetime, "datetime", mock.Mock(**{"now.return_value.strftime.return_value": "a" * 300}))
@@ -124,6 +127,8 @@ def test_a_damaged_run_hides_no_other(tmp_path, capsys):
     make_run(tmp_path, "20260101-000000", results=FINISHED, total=2)
     (make_run(tmp_path, "20260102-000000") / "config.json").write_text("{")
     (make_run(tmp_path, "20260103-000000") / "config.json").write_text('{"model_type": "qwen2_5_vl"}')
+    foreign = json.loads((make_run(tmp_path, "20260105-000000") / "config.json").read_text())
+    write_json(tmp_path / "coin" / "20260105-000000" / "config.json", foreign | {"experiment": "die"})
     for arguments in (["list"], ["list", "coin"]):
         assert main([*arguments, "--runs-dir", str(tmp_path)], package=FAKES) == 0
         out = capsys.readouterr().out
@@ -131,6 +136,7 @@ def test_a_damaged_run_hides_no_other(tmp_path, capsys):
         assert "20260102-000000/config.json is damaged" in out
         assert "20260103-000000/config.json is not that of a run" in out
         assert "20260104-000000/config.json'" in out
+        assert f"20260105-000000 is a run of die: move it to {tmp_path / 'die'}" in out
         assert out.count("must be readable; correct its permissions") == 1
     (tmp_path / "coin").rename(tmp_path / "away")
     (tmp_path / "coin").symlink_to(UNREADABLE)

@@ -16,7 +16,9 @@ class Training:
     rate: float = 0.1
     forces: tuple[float, ...] = (1.0, 5.0)
     shift: float = 0.0
+    grids: tuple[int, ...] = (24, 48)
     first_seed: int = 3
+    seeds: tuple[int, ...] = (1, 2)
     kept: bool = True
 
 
@@ -52,6 +54,7 @@ SCALES = (Config(), Config(training=Training(shift=-1.0), moments=0))
         ({"rate": 1e300}, r"training.rate is 1e\+300: must be at most 1e\+15; lower it"),
         ({"shift": -1e16}, r"training.shift is -1e\+16: must be at most 1e\+15; lower it"),
         ({"forces": (1.0, 1e-300)}, r"training.forces is .*: must be 0 or at least 1e-30; raise it"),
+        ({"grids": (24, 0)}, r"training.grids is \(24, 0\): must be at least 1; raise it"),
         ({"first_seed": -1}, "training.first_seed is -1: must be at least 0; raise it"),
     ],
 )
@@ -61,7 +64,7 @@ def test_what_no_scale_has_is_refused(change, said):
 
 
 def test_what_a_scale_has_or_a_class_checks_itself_is_taken():
-    training = Training(shift=-3.0, first_seed=0, rate=0.0, forces=(0.0,), kept=False)
+    training = Training(shift=-3.0, first_seed=0, seeds=(0,), rate=0.0, forces=(0.0,), kept=False)
     require_sizes(Config(training=training, checked=Checked(steps=0), moments=0, most=-1), SCALES)
     many = Config(moments=10**9)
     require_sizes(dataclasses.replace(many, moments=10**12), (many,))

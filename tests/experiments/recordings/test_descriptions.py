@@ -1,6 +1,7 @@
 """Descriptions of videos: each of its own file, and of what the file holds now."""
 
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from experiments.recordings import descriptions
 from experiments.recordings.descriptions import describe_files, families, videos_of
+from tests.sensors_io.importers.films import film, uneven_film
 
 
 @pytest.fixture
@@ -32,8 +34,21 @@ def test_videos_of_one_name_are_told_apart_and_one_that_is_named_twice_counts_on
     assert found.x[:, 0].tolist() == [1, 2, 3]
 
 
-def test_a_video_that_was_recorded_anew_is_described_anew(described, tmp_path):
+def test_a_video_that_was_recorded_anew_or_is_read_by_other_kernels_is_described_anew(described, tmp_path, monkeypatch):
     file = write(tmp_path / "press.mov", "1")
     assert described([file]).x[0, 0] == 1
     os.utime(write(file, "2"), ns=(0, 10**18))  # of the same size
     assert described([file]).x[0, 0] == 2
+    monkeypatch.setattr(descriptions, "describe", lambda touch: np.full(len(families()), 3, np.float32))
+    assert described([file]).x[0, 0] == 2
+    monkeypatch.setenv("OPENCV_IPP", "disabled")
+    assert described([file]).x[0, 0] == 3
+
+
+def test_videos_that_are_left_out_and_copies_are_named_before_anything_is_learned(tmp_path, context):
+    press, still = film(tmp_path / "press.avi"), uneven_film(tmp_path / "still.mp4", [0, 40, 80, 120])
+    shutil.copy(press, copy := tmp_path / "copy.avi")
+    assert describe_files([press, still, copy], 2, context).names.tolist() == ["press.avi", "copy.avi"]
+    printed = context.console.file.getvalue()
+    assert "left out: still.mp4 shows one picture in all of its 4 frames: a touch changes them; record it\n" in printed
+    assert "the same video of several objects, left in: press.avi, copy.avi\n" in printed

@@ -85,6 +85,14 @@ def test_a_kept_policy_answers_for_a_folder(run):
     again = [str(unseen / "new.avi"), str(data / "videos" / "thing5_0.avi")]
     assert run_small("--predict", *again, "--out", str(out), "--policy", policy, *places) == 0
     assert json.loads(out.read_text()).keys() == {"new.avi", "thing5_0.avi", "together"}
+    other = shutil.copytree(data, home / "other")
+    table = json.loads((other / "labels.json").read_text())
+    (other / "labels.json").write_text(json.dumps(table | {"objects": table["objects"][:5]}))
+    for folder, number in ((data, 6), (other, 5)):  # the cache has the policy of the first
+        order = ["--objects", "None", "--data-dir", str(folder), "--fresh"]
+        assert run_small("--predict", str(unseen), "--out", str(out), *order, *places) == 0
+        results = read_json(home / "runs" / "physiclear" / "latest" / "results.json")
+        assert results["settings"]["objects learned from"] == number
 
 
 @pytest.mark.parametrize("name", ["physiclear", "sim_to_real"])

@@ -12,8 +12,8 @@ from rich.console import Console
 
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError, DataError
+from experiments.encoder.pretrain import StageOneDataConfig, open_touch
 from experiments.study import sources
-from experiments.study.dataset import split_parts
 from experiments.study.sources import SourceConfig, odd_contacts, prepare_records
 from experiments.study.training import open_data, require_encoder
 from sensors_io.commands.label import Label
@@ -117,8 +117,9 @@ def test_imported_videos_are_named_by_folder_and_settings(tmp_path, context, mon
 
 
 def test_odd_contacts_of_recordings_are_listed_before_training_and_left_out_on_request(data, tmp_path, context):
-    """The fourth contact is black for one sensor; one object was never touched."""
-    store, black = data.store, 3
+    """Of training contacts one is black for one sensor, one a copy of the first; one object was never touched."""
+    store = data.store
+    first, black, *_, copy = train = store.contacts_of_split("train").tolist()
     with RecordWriter(tmp_path / "odd", meta=store.meta) as writer:
         for card in store.objects.values():
             writer.write_object(card)
@@ -127,14 +128,23 @@ def test_odd_contacts_of_recordings_are_listed_before_training_and_left_out_on_r
             sequences = list(store.contact(i).values())
             if i == black:
                 sequences[0] = dataclasses.replace(sequences[0], frames=np.zeros_like(sequences[0].frames))
+            if i == copy:
+                sequences = [dataclasses.replace(x, key=store.contacts[i]) for x in store.contact(first).values()]
             writer.write_contact(sequences)
-    config = SourceConfig(data="records", data_dir=tmp_path / "odd")
-    assert odd_contacts(config, tmp_path / "odd", context) == (black,)
+    config = StageOneDataConfig(data="records", data_dir=tmp_path / "odd")
+    assert odd_contacts(config, tmp_path / "odd", context) == tuple(sorted((first, black, copy)))
+    parts = open_touch(dataclasses.replace(config, drop_odd=True), 2, 16, context).parts
+    assert set(np.concatenate(list(parts.values()))) == set(range(len(store))) - {first, black, copy}
     printed = context.console.file.getvalue()
-    assert f"all pictures black: 1 of {len(store)} contacts are trained on (--drop-odd leaves them out)" in printed
+    assert f"all pictures black: 1 of {len(store)} contacts are trained on (option drop-odd leaves them out)" in printed
+    twins = ", ".join(store.contacts[i].object_id for i in (first, copy))
+    assert f"the same recording as of another object: 2 of {len(store)} contacts are left out: {twins}\n" in printed
     assert f"without any contact: 1 of {len(store.objects) + 1} objects, such as untouched" in printed
-    parts = split_parts(store, 0.35, left_out=(black,))
-    assert set(np.concatenate(list(parts.values()))) == set(range(len(store))) - {black}
+    assert f"gelsight_mini: {len(store)} of 28 × 28 at " in printed
+    (hardness,) = (line for line in printed.splitlines() if line.startswith("hardness, objects of levels 0 to 2: "))
+    for part, rows in (("training", train[2:-1]), ("test", store.contacts_of_split("test"))):
+        levels = [store.objects[store.contacts[i].object_id].labels["hardness"] for i in rows]
+        assert f"{part} {levels.count(0)}, {levels.count(1)}, {levels.count(2)}" in hardness
     assert odd_contacts(GENERATED, store.path, context) == ()
 
 

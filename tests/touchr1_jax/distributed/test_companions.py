@@ -5,6 +5,7 @@ import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -29,17 +30,18 @@ def test_what_differs_is_named_by_its_path(there, lines):
     assert different(HERE, there) == lines
 
 
-def start(home, *options):
-    """Two processes of the training in `spread`, over loopback; each has options of its own."""
+def start(home, *options, folders=(None, None)):
+    """Two processes of the training in `spread`, over loopback; each has options and a working directory of its own."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
     command = [sys.executable, "-m", "tests.experiments.core.spread", "--runs-dir", home / "runs", "--cache-dir"]
     command += [home / "data", "--distributed", "--mesh.fsdp", "2", "--coordinator", address, "--processes", "2"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    environment = os.environ | {"JAX_PLATFORMS": "cpu"}
+    environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": os.getcwd()}
     orders = ([*command, "--process", str(i), *own] for i, own in enumerate(options))
-    return [subprocess.Popen(order, env=environment, **pipes) for order in orders]
+    started = zip(orders, folders, strict=True)
+    return [subprocess.Popen(order, env=environment, cwd=folder, **pipes) for order, folder in started]
 
 
 def errors(process):
@@ -53,6 +55,15 @@ def test_two_configurations_are_named_before_anything_is_compiled(tmp_path):
         assert "config.steps is {} here and {} there".format(*steps) in errors(process)
         assert process.returncode == 1
     assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.slow
+def test_processes_without_a_common_folder_are_named(tmp_path):
+    for folder in (folders := (tmp_path / "a", tmp_path / "b")):
+        folder.mkdir()
+    first, second = start(Path(), [], [], folders=folders)
+    assert f"DifferentProcessesError: process 1 does not see {folders[1] / 'runs' / 'spread'}" in errors(second)
+    assert errors(first).startswith("Process 1 of this run ended early, so process 0 ends too.")
 
 
 @pytest.mark.slow
