@@ -105,7 +105,7 @@ def write_text(path: Path, text: str) -> None:
 def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = False, of: str = "") -> None:
     """Publish arrays as one NumPy file, atomically; `of` says what they are, for `read_arrays`."""
     buffer = io.BytesIO()
-    (np.savez_compressed if compressed else np.savez)(buffer, **arrays, **({_OF: np.array(of)} if of else {}))
+    (np.savez_compressed if compressed else np.savez)(buffer, **({**arrays, _OF: np.array(of)} if of else arrays))
     write_bytes(path, buffer.getvalue())
 
 
