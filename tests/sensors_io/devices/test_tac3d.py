@@ -104,6 +104,7 @@ def empty(height, width):
         (empty(2**32, 2**32), b"", "are not 0 bytes"),  # whose product is 0 in 64 bits
         (empty(0, 10**30), b"", "are not 0 bytes"),
         (GOOD.replace(b"index: 10", b"index: ten"), b"\0" * 24, "lacks a readable index"),
+        (GOOD.replace(b"index: 10", b"index: -9223372036854775808"), b"\0" * 24, "must be within ±2"),
         (b"index: 1\nSN: x\ntimestamp: 2\ndata:\n", b"", "lists no array"),
         (b"index: 1\nSN: x\ntimestamp: 2\ndata: \xff\n", b"", "lists no array"),
     ],
