@@ -116,9 +116,9 @@ def test_an_old_number_after_a_silence_is_a_duplicate():
 
 def test_a_clock_that_stands_still_is_named_once():
     intake = Intake(capacity=99, clock=JumpingClock())
+    samples = [dataclasses.replace(sample(k, time_ms=33 * k), device_time_ns=0) for k in range(90)]
     with pytest.warns(WrongRateWarning, match="fall behind") as told:
-        for k in range(90):
-            intake.offer(dataclasses.replace(sample(k, time_ms=33 * k), device_time_ns=0))
+        [intake.offer(one) for one in samples]
     assert len(told) == 1
 
 
