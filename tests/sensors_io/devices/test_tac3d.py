@@ -205,6 +205,7 @@ def test_an_incomplete_recording_is_refused(tmp_path):
         {"sendTimestamp": np.array([0, 1e12, 2e12])},
         {"sendTimestamp": np.array(["a", "b", "c"])},
         {"index": np.array([0, np.nan, 1])},
+        {"index": np.array([0, 0.03, 0.06])},  # the file of the times in its place
         {"index": np.array(["a", "b", "c"])},
         {"index": np.array([1, 2, 2**63], np.uint64)},
         {"3D_ResultantForce": np.full((3, 1, 3), "a")},
