@@ -196,7 +196,7 @@ def read_description(directory: Path) -> dict[str, Any]:
 
 
 def labelled(directory: Path, name: str) -> str:
-    """What a file of a run says that it is, so that one of another run is not taken for it: a name and a configuration.
+    """Name and configuration that a file of a run states, so that one of another run is not taken for it.
 
     Runs of one configuration make the same files.  A folder without `config.json` is a unit of work, which has its own.
     """

@@ -53,7 +53,7 @@ def load_answers(path: Path) -> Evaluation:
 
 
 def _label(path: Path) -> str:
-    """What the answers in a run's file say that they are."""
+    """Label of the answers in a run's file."""
     return labelled(path.parents[1], f"answers/{path.stem}")
 
 
