@@ -82,7 +82,8 @@ class Checkpoints:
       keep: how many of the newest stay.
       better: which held-out scores are better, to keep the best checkpoint too; `None` if checkpoints have no score.
       print_: receives a line about each damaged checkpoint that is skipped; standard error by default.
-      of: what the checkpoints say that they are of; those of something else count as damaged.
+      of: what the checkpoints say that they are of; those of something else, or of another step, count as damaged.
+        Without it all are read.
 
     Raises:
       CheckpointError: the directory cannot be read or written.
@@ -276,7 +277,7 @@ class Checkpoints:
         if not intact:
             raise DamagedCheckpointError(f"{where}: the checksum of its data does not hold")
         label = self._label(step)  # in a checkpoint of an earlier version there is none
-        if held.get("of", label) != label:
+        if self._of and held.get("of", label) != label:
             raise DamagedCheckpointError(f"{where} is of {held['of']}: must be of {label}")
         changed = [name for name, value in _digests(found.state).items() if digests.get(name) != value]
         if changed:

@@ -151,6 +151,8 @@ class TestDamage:
         with Checkpoints(tmp_path / "mine", print_=told.append, of="mine") as checkpoints:
             assert checkpoints.restore(self.numbers(0)).step == left
         assert f"is of {source} step 2: must be of mine step 3" in told[0]
+        with Checkpoints(tmp_path / "mine") as checkpoints:
+            assert checkpoints.restore(self.numbers(0)).step == left
 
     def test_a_flipped_bit_of_any_file_does_not_pass(self, stage):
         """Of a few places of each, its checksums among them, before Orbax reads anything."""
