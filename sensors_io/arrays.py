@@ -48,6 +48,8 @@ def load_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
             for member in archive.infolist():
                 with archive.open(member) as file:
                     found[member.filename.removesuffix(".npy")] = _array(file, member.file_size)
+            if len(found) < len(archive.infolist()):
+                raise ValueError("it holds two arrays of one name")
             return found
     except _BROKEN as error:
         if of_system(error):

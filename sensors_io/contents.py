@@ -6,7 +6,7 @@ import pathlib
 from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as Seq
 
-from sensors_io.codec import decode_card, encode_sequence
+from sensors_io.codec import CorruptRecordsError, decode_card, encode_sequence
 from sensors_io.index import Index, Part
 from sensors_io.remote import Mirror, Place
 from sensors_io.schema import ObjectCard, SchemaError, Sequence
@@ -94,11 +94,18 @@ class Cards(Mapping[str, ObjectCard]):
     def __getitem__(self, name: str) -> ObjectCard:
         card = self._known.get(name)
         if card is None:
-            card = self._known[name] = self._entries.decode(self._numbers[name], decode_card)
+            card = self._known[name] = self._entries.decode(self._numbers[name], lambda data: _card_of(name, data))
             while len(self._known) > _CARDS:
                 with contextlib.suppress(KeyError):  # another thread may have removed it
                     self._known.popitem(last=False)
         return card
+
+
+def _card_of(name: str, data: bytes) -> ObjectCard:
+    card = decode_card(data)
+    if card.object_id != name:
+        raise CorruptRecordsError(f"the card is of {card.object_id}, the index says {name}")
+    return card
 
 
 def convert(root: pathlib.Path, index: Index) -> bool:

@@ -141,6 +141,8 @@ class Index:
     @classmethod
     def _opened(cls, root: Place, tree: Mapping[str, Any]) -> Self:
         tables = {name: GrowingFile(**tree["tables"][name]) for name in TABLES}
+        if any(pathlib.PurePath(t.file).name != t.file for t in tables.values()):
+            raise ValueError(f"the file of a table in {tree['tables']} must be a name in its folder")
         meta = _meta(tree)
         types = dict(zip(TABLES, (contact_dtype(len(meta.sensors)), SHARD, _BYTES, SHARD), strict=True))
         read = {

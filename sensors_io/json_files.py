@@ -4,6 +4,7 @@ A *sealed* object ends with the CRC-32 of the text before it, since a flipped bi
 Objects without this key, such as those of earlier versions, are read as well.
 """
 
+import collections
 import json
 import os
 import pathlib
@@ -58,7 +59,21 @@ def read_json(path: pathlib.Path) -> Any:
     Raises:
       OSError, ValueError: it cannot be read, or its checksum does not hold.
     """
+    require_regular(path)
     return unseal(path.read_text(encoding="utf-8"))
+
+
+def distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """A JSON object of its names and values, as a hook of `json.loads`, which would take the last of two of one name.
+
+    Raises:
+      ValueError: a name is there twice.
+    """
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        twice = collections.Counter(name for name, _ in pairs).most_common(1)[0][0]
+        raise ValueError(f"{twice!r} stands there twice in one object: keep one of them")
+    return found
 
 
 def seal(text: str) -> str:
@@ -73,10 +88,10 @@ def unseal(text: str) -> Any:
     """The value of a JSON text, without its checksum.
 
     Raises:
-      ValueError: it is no JSON, or its checksum does not hold.
+      ValueError: it is no JSON, an object has two values of one name, or its checksum does not hold.
     """
     try:
-        value, text = json.loads(text), text.rstrip()
+        value, text = json.loads(text, object_pairs_hook=distinct), text.rstrip()
     except RecursionError as error:
         raise ValueError("it nests too deeply") from error
     end = text.rfind('"')

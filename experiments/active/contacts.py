@@ -134,7 +134,7 @@ def generate(config: ContactsConfig, context: Context) -> ContactBank:
     files, units = {f"{folder}/{part[0]:06d}": functools.partial(contacts_of, config, part) for part in parts}, []
     for name, make in files.items():
         path = (context.cache_dir / f"{name}.npz").absolute()
-        units.append(WorkUnit(name=name, run=functools.partial(_write, path, make), done=path.exists))
+        units.append(WorkUnit(name=name, run=functools.partial(_write, path, name, make), done=path.exists))
     launcher = context.launcher
     if launcher.here:
         launcher = Launcher(workers=max(1, min(idle_cores(context), len(units) // _FILES_A_WORKER)))
@@ -157,8 +157,8 @@ def contacts_of(config: ContactsConfig, objects: range) -> dict[str, np.ndarray]
     return {"frames": np.stack(frames), "harm": np.stack(harm)}
 
 
-def _write(path: Path, make: Callable[[], dict[str, np.ndarray]]) -> None:
-    write_arrays(path, make())
+def _write(path: Path, name: str, make: Callable[[], dict[str, np.ndarray]]) -> None:
+    write_arrays(path, make(), of=name)
 
 
 def contacts_hash(config: ContactsConfig) -> str:

@@ -17,7 +17,10 @@ from typing import Any
 
 import numpy as np
 
+from sensors_io.arrays import ArraysError, load_arrays
 from sensors_io.json_files import require_regular, seal, unseal
+
+_OF = "of"  # entry of a file of arrays that says what they are
 
 
 class DamagedFileError(ValueError):
@@ -99,11 +102,24 @@ def write_text(path: Path, text: str) -> None:
     write_bytes(path, text.encode(errors="backslashreplace"))
 
 
-def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = False) -> None:
-    """Publish arrays as one NumPy file, atomically."""
+def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = False, of: str = "") -> None:
+    """Publish arrays as one NumPy file, atomically; `of` says what they are, for `read_arrays`."""
     buffer = io.BytesIO()
-    (np.savez_compressed if compressed else np.savez)(buffer, **arrays)
+    (np.savez_compressed if compressed else np.savez)(buffer, **({**arrays, _OF: np.array(of)} if of else arrays))
     write_bytes(path, buffer.getvalue())
+
+
+def read_arrays(path: Path, of: str) -> dict[str, np.ndarray]:
+    """Arrays that `write_arrays` published; files of earlier versions do not say what they are.
+
+    Raises:
+      ArraysError: they cannot be read, or are of something else, as a whole file that was put in this place.
+    """
+    arrays = load_arrays(path)
+    said = str(arrays.pop(_OF, of))
+    if said != of:
+        raise ArraysError(f"{path} is of {said}: must be of {of}; put its own copy back, or remove it")
+    return arrays
 
 
 def write_json(path: Path, value: Any) -> None:

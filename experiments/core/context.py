@@ -19,6 +19,7 @@ from experiments.core.artifacts import (
     DamagedFileError,
     UnwrittenError,
     fitting,
+    read_arrays,
     read_json,
     read_times,
     write_arrays,
@@ -27,8 +28,9 @@ from experiments.core.artifacts import (
 from experiments.core.errors import ConfigurationError
 from experiments.core.metric_log import MetricLog, damaged_log, read_metrics, summary
 from experiments.core.progress import Advance, Loop, ProgressCallback, TrainingSample, Watcher, show_progress
+from experiments.core.runs import labelled
 from experiments.core.stopping import Stopping
-from sensors_io.arrays import ArraysError, load_arrays
+from sensors_io.arrays import ArraysError
 from sensors_io.units import HERE, Launcher
 from touchr1_jax.distributed.processes import SINGLE_PROCESS, ProcessGroup, SingleDevice
 from touchr1_jax.training.compilation import drop_programs
@@ -240,7 +242,7 @@ class Context:
         if not path.exists():
             return False
         try:
-            _saved_result(path)
+            self._saved_result(stage)
         except DamagedFileError as error:
             self.print(f"{path} is damaged ({error.__cause__}), and stage {stage} is done again")
             return False
@@ -249,7 +251,7 @@ class Context:
     def save_stage(self, stage: str, result: Any) -> None:
         """Write the result of a finished stage as JSON, which marks the stage as done."""
         self.require_in_place()
-        content = {"stage": stage, "result": result}
+        content = {"stage": labelled(self.directory, stage), "result": result}
         self.processes.write_once(lambda: write_sealed(self._stage_file(stage), content))
 
     def load_stage(self, stage: str) -> Any:
@@ -257,7 +259,7 @@ class Context:
         path = self._stage_file(stage)
         if not path.exists():
             raise FileNotFoundError(f"stage {stage!r} has no result at {path}: finish and save the stage first")
-        return _saved_result(path)
+        return self._saved_result(stage)
 
     def once(self, stage: str, compute: Callable[[], Any]) -> Any:
         """The saved result of a stage, in JSON's types; it is computed and saved first if the stage is not done."""
@@ -285,11 +287,11 @@ class Context:
         path = self.cache_dir / f"{name}.npz"
         if path.exists():
             try:
-                return load_arrays(path)
+                return read_arrays(path, name)
             except ArraysError as error:
                 self.print(f"{error}: it is made again")
-        write_arrays(path, make(), compressed=compressed)
-        return load_arrays(path)
+        write_arrays(path, make(), compressed=compressed, of=name)
+        return read_arrays(path, name)
 
     @contextlib.contextmanager
     def timed(self, stage: str) -> Iterator[None]:
@@ -323,15 +325,20 @@ class Context:
         for watcher in self._watchers:
             watcher.closed()
 
+    def _saved_result(self, stage: str) -> Any:
+        """The result in the file of a stage; earlier versions wrote the result alone, or with the stage's bare name."""
+        path = self._stage_file(stage)
+        content = read_json(path)
+        if not isinstance(content, dict) or content.keys() != {"stage", "result"}:
+            return content
+        if content["stage"] not in (stage, labelled(self.directory, stage)):
+            other = ValueError(f"it is of stage {content['stage']!r}, or of another run")
+            raise DamagedFileError(f"{path} is damaged ({other}): put its own copy back, or remove it") from other
+        return content["result"]
+
     def _stage_file(self, stage: str) -> Path:
         path = self.directory / "stages" / _checked(stage)
         return path.with_name(path.name + ".json")
-
-
-def _saved_result(path: Path) -> Any:
-    """The result in the file of a stage; earlier versions wrote the result alone."""
-    content = read_json(path)
-    return content["result"] if isinstance(content, dict) and content.keys() == {"stage", "result"} else content
 
 
 def _checked(stage: str) -> str:

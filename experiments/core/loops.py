@@ -7,6 +7,7 @@ from typing import Any
 from experiments.core.context import Context
 from experiments.core.progress import TrainingSample
 from experiments.core.results import Table, named_table
+from experiments.core.runs import labelled
 from touchr1_jax.rl.scoring import NONFINITE_IN
 from touchr1_jax.training.checkpoint import Checkpoints
 from touchr1_jax.training.loop import SKIPPED, Batches, Hooks, Log, LoopConfig, LoopTime, Step, fit
@@ -51,7 +52,9 @@ def stage_hooks(
     times, logs, left_out = LoopTime(), list[Log](), [0.0]
     folder = context.checkpoint_dir(stage)
     with (
-        Checkpoints(folder, better="higher" if scored else None, print_=context.print) as checkpoints,
+        Checkpoints(
+            folder, better="higher" if scored else None, print_=context.print, of=labelled(context.directory, stage)
+        ) as checkpoints,
         context.timed(stage),
         context.stopping.patient(context.processes.any) as stopping,
         context.compiling(stage.rpartition("/")[0]) as compiled,  # all seeds run one program

@@ -13,6 +13,7 @@ import fcntl
 import functools
 import hashlib
 import importlib.metadata
+import json
 import os
 import platform
 import shlex
@@ -194,6 +195,16 @@ def read_description(directory: Path) -> dict[str, Any]:
             "away and start a new one"
         )
     return found
+
+
+def labelled(directory: Path, name: str) -> str:
+    """Name and configuration that a file of a run states, so that one of another run is not taken for it.
+
+    Runs of one configuration make the same files.  A folder without `config.json` is a unit of work, which has its own.
+    """
+    described = (directory / "config.json").exists()
+    config = json.dumps(read_description(directory)["config"], sort_keys=True) if described else ""
+    return f"{name} {hashlib.sha256(config.encode()).hexdigest()[:8]}"
 
 
 def _describes_run(found: Any) -> bool:

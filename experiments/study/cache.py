@@ -18,11 +18,10 @@ import numpy as np
 from flax import traverse_util
 
 from experiments.core import numerics
-from experiments.core.artifacts import jsonable, write_arrays
+from experiments.core.artifacts import jsonable, read_arrays, write_arrays
 from experiments.core.context import Context
 from experiments.core.metric_log import read_metrics
 from experiments.core.runs import ROOT, versions
-from sensors_io.arrays import load_arrays
 from touchr1_jax.types import Params
 
 NEVER = (
@@ -86,7 +85,7 @@ def cached(
             context.print(f"{stage}: {path} is damaged ({error}), and is made again")
     params = train()
     lines = np.frombuffer(json.dumps(_logged(context, stage)).encode(), np.uint8)
-    context.processes.write_once(lambda: write_arrays(path, {_LINES: lines, **_flat(params)}))
+    context.processes.write_once(lambda: write_arrays(path, {_LINES: lines, **_flat(params)}, of=digest))
     return params
 
 
@@ -121,7 +120,7 @@ def _flat(tree: Mapping[str, Any]) -> dict[str, Any]:
 
 def read_policy(path: Path) -> tuple[Params, list[dict[str, Any]]]:
     """Parameters of a policy in the cache, and the lines that its training logged; errors are those of `DAMAGED`."""
-    arrays = load_arrays(path)
+    arrays = read_arrays(path, path.stem)
     lines = json.loads(arrays.pop(_LINES).tobytes())
     return traverse_util.unflatten_dict({name: jnp.asarray(x) for name, x in arrays.items()}, sep="/"), lines
 

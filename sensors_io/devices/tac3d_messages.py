@@ -296,12 +296,13 @@ def load_recording(path: pathlib.Path) -> Tac3dArrays:
 
 
 def _require_numbers(path: pathlib.Path, name: str, array: np.ndarray) -> None:
-    """Refuse a row of times or counts, or fields, that are no numbers, and times or counts beyond what 64 bits hold."""
-    top = _LATEST_S if name.endswith("Timestamp") else 2.0**63 if name == "index" else None
-    numbers = array.ndim > 0 and array.dtype.kind in "fiu"
+    """Refuse times, counts or fields that are no numbers, times or counts beyond 64 bits, and parts of a count."""
+    count = name == "index"
+    top = _LATEST_S if name.endswith("Timestamp") else 2.0**63 if count else None
+    numbers = array.ndim > 0 and array.dtype.kind in "fiu" and not (count and np.any(array != np.trunc(array)))
     if not numbers or (top is not None and not np.all(np.abs(array.astype(np.float64)) < top)):
         raise DeviceDataError(
-            f"{path}: {name} is {array.dtype}{list(array.shape)}: must hold a number for each message"
+            f"{path}: {name} is {array.dtype}{list(array.shape)}: must hold a {'whole ' * count}number for each message"
             + ("" if top is None else f", finite and below {top:g}")
             + "; copy the recording again"
         )

@@ -30,11 +30,11 @@ trial that is free.
 import dataclasses
 import json
 import pathlib
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
 from sensors_io.importers.keep import LEAST_HZ, MOST_HZ, ImportSourceError
+from sensors_io.json_files import distinct
 from sensors_io.schema import ATTRIBUTES, LEVELS, MATERIALS, MOTIONS, SENSORS, UNKNOWN
 
 PLACEHOLDER = "?"
@@ -155,7 +155,7 @@ def read_map(path: pathlib.Path) -> LayoutMap:
       ImportSourceError: no such file, no JSON, or an entry that does not fit; the message names it.
     """
     try:
-        found = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_distinct)
+        found = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=distinct)
     except (OSError, ValueError, RecursionError) as error:
         raise ImportSourceError(f"{path} is no mapping: {error}; write one, as `--inspect` proposes") from error
     root = _Entry(found, path.name)
@@ -185,14 +185,6 @@ def read_map(path: pathlib.Path) -> LayoutMap:
         labels={name: _label(labels.part(name), name) for name in labels.found},
         sensors={name: _stream(sensors.part(name)) for name in sensors.found},
     )
-
-
-def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object; JSON would take the last of two values of one name, without a word."""
-    twice = next((name for name, count in Counter(name for name, _ in pairs).items() if count > 1), None)
-    if twice is not None:
-        raise ValueError(f"{twice!r} stands there twice in one object: keep one of them")
-    return dict(pairs)
 
 
 _VALUES = ("object_id", "site", "motion", "trial")

@@ -24,6 +24,7 @@ from sensors_io.importers.holdout import hold_out
 from sensors_io.importers.keep import ImportSourceError, Keep, Skip, check_share
 from sensors_io.importers.pictures import film, nominal_ns
 from sensors_io.importers.video import VideoError, read_video
+from sensors_io.json_files import distinct
 from sensors_io.schema import ATTRIBUTES, MATERIALS, UNKNOWN, ContactKey, ObjectCard
 
 SENSOR = "gelsight_mini"
@@ -125,7 +126,7 @@ def read_labels(path: pathlib.Path) -> list[LabelledObject]:
     if not path.is_file():
         raise ImportSourceError(f"{path} is missing: give the directory that holds labels.json and videos/")
     try:
-        entries = json.loads(path.read_text(encoding="utf-8"))["objects"]
+        entries = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=distinct)["objects"]
         objects = [_labelled(entry) for entry in entries]
     except MALFORMED as error:
         raise ImportSourceError(f"{path}: {told(error)}; correct the entry") from error

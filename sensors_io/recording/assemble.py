@@ -23,6 +23,7 @@ _GAP_PERIODS = 1.5  # between two frames: one is missing
 _GAP_STEPS = 3.0  # of the usual size, where the period is unknown
 _SILENT_S = 1.0  # before the first frame or after the last of a contact: a device is taken as lost sooner
 _INT64 = np.iinfo(np.int64)
+_KINDS = ("start", "phase", "frame", "force", "end")
 _MADE_HERE = ("frames", "host_time_ns", "device_time_ns", "force_time_ns", "target_force_n", "phase", "flags")
 
 
@@ -69,11 +70,13 @@ def assemble(path: pathlib.Path) -> Assembled | None:
 
 
 def _assembled(start: Mapping[str, Any], entries: Seq[JournalEntry], torn: int) -> Assembled | None:
+    streams = range(len(start["streams"]))
+    for e in entries:  # one that nothing reads would be gone with its journal
+        if e.kind not in _KINDS or (e.kind == "frame" and e.plain["stream"] not in streams):
+            raise ValueError(f"{e.kind} of stream {e.plain.get('stream')!r}")
     ends = [e for e in entries if e.kind == "end"]
     end = ends[0].plain if ends else None
-    frames = [
-        [e for e in entries if e.kind == "frame" and e.plain["stream"] == i] for i in range(len(start["streams"]))
-    ]
+    frames = [[e for e in entries if e.kind == "frame" and e.plain["stream"] == i] for i in streams]
     if not any(frames):
         return None
     backgrounds = _backgrounds(start, [entries[0], *ends])

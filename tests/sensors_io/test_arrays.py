@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import zipfile
 
 import numpy as np
 import pytest
@@ -37,6 +38,13 @@ def npy(header):
 def test_what_is_no_array_is_refused(tmp_path, data, message):
     (tmp_path / "a.npy").write_bytes(data)
     refused(ArraysError, message, load_arrays, tmp_path / "a.npy")
+
+
+def test_two_arrays_of_one_name_are_refused(tmp_path):
+    np.savez(tmp_path / "x.npz", a=np.zeros(2))
+    with zipfile.ZipFile(tmp_path / "x.npz", "a") as archive, archive.open("a", "w") as file:
+        np.save(file, np.ones(2))
+    refused(ArraysError, "two arrays of one name", load_arrays, tmp_path / "x.npz")
 
 
 @pytest.mark.parametrize("name", ["a.npy", "a.npz"])

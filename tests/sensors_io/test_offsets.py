@@ -1,6 +1,7 @@
 """Offsets come back from their file, and a file that holds none is named."""
 
 import json
+import os
 
 import pytest
 
@@ -38,3 +39,10 @@ def test_offsets_come_back(tmp_path):
 def test_anything_else_is_refused(tmp_path, tree, end):
     (tmp_path / "s.json").write_text(json.dumps(tree)[:end])
     refused(OffsetsError, "make them with `sync`", Offsets.load, tmp_path / "s.json")
+
+
+def test_a_pipe_and_a_value_that_is_there_twice_are_refused(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    refused(OffsetsError, "a pipe", Offsets.load, tmp_path / "pipe")
+    (tmp_path / "s.json").write_text('{"reference": "a", "sensors": {}, "reference": "b"}')
+    refused(OffsetsError, "'reference' stands there twice", Offsets.load, tmp_path / "s.json")

@@ -179,6 +179,26 @@ def shard(change):
     return lambda path: shards(path)[0].write_bytes(change(shards(path)[0].read_bytes()))
 
 
+def swap_cards(path):
+    """Let the two shards of cards, which are of one size, take each other's place."""
+    first, second = sorted(path.glob("objects-*.arrayrecord"))
+    (held := path / "held").write_bytes(first.read_bytes())
+    second.replace(first)
+    held.replace(second)
+
+
+def root_of_table(file):
+    """Let the root name a table elsewhere, which a writer that goes on would overwrite."""
+
+    def change(path):
+        root = json.loads((path / "index.json").read_text())
+        del root["crc32"]
+        root["tables"]["contacts"]["file"] = file
+        (path / "index.json").write_text(json.dumps(root))
+
+    return change
+
+
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
@@ -188,6 +208,8 @@ def shard(change):
         (shard(lambda data: flipped(data, len(data) // 4)), "00000.arrayrecord, entry .* copy the file"),
         (lambda path: rewrite(shards(path)[0], lambda es: map(flipped, es)), "entry 0: the entry's checksum does not"),
         (lambda path: rewrite(shards(path)[0], reversed), "entry 0 is object_0/0/press/1/dmtac_x, the index says"),
+        (swap_cards, "the card is of object_1, the index says object_0"),
+        *((root_of_table(file), "must be a name in its folder") for file in ("../index.contacts", "/index.contacts")),
     ],
 )
 def test_damage_is_named(path, damage, said):

@@ -52,6 +52,14 @@ def test_a_clock_that_stands_still_or_runs_slow_is_left_for_the_arrival(rate):
     assert not clock.slow  # the clock has restarted
 
 
+@pytest.mark.parametrize(("rate", "slow"), [(0.972, False), (0.965, True)])
+def test_a_clock_is_slow_that_falls_behind_by_more_than_3_percent(rate, slow):
+    clock = ClockMap()
+    for arrival in range(0, 20 * NS_PER_S, 33 * MS):
+        clock.to_host_ns(round(rate * arrival), arrival)
+    assert clock.slow == slow
+
+
 @pytest.mark.parametrize("stall_s", [0.3, 1.0, 4.0])
 def test_samples_that_a_stall_held_up_are_no_slow_clock(stall_s):
     clock = ClockMap()
@@ -119,5 +127,12 @@ def test_a_late_sample_is_told_from_a_duplicate_and_a_restart():
 
 def test_periods_count_what_is_missing_and_take_back_what_was_late():
     gaps = PeriodGaps(10 * MS)
-    times = [0, 10, 20, 50, 60, 76, 80, 90]  # two lost before 50; 70 comes 6 ms late
-    assert [gaps.step(t * MS).missing for t in times] == [0, 0, 0, 2, 0, 1, -1, 0]
+    times = [0, 10, 20, 50, 60, 76, 80, 90, 70]  # two lost before 50; 70 comes 6 ms late; in the end 20 ms back
+    assert [gaps.step(t * MS).missing for t in times] == [0, 0, 0, 2, 0, 1, -1, 0, -1]
+
+
+@pytest.mark.parametrize(("share", "followed"), [(0.92, 0.95), (1.02, 1.02), (1.08, 1.05)])
+def test_a_period_is_followed_to_5_percent(share, followed):
+    gaps = PeriodGaps(10 * MS)
+    assert not any(gaps.step(round(k * share * 10 * MS)).missing for k in range(200))
+    assert gaps._period_ns == pytest.approx(followed * 10 * MS, rel=1e-3)

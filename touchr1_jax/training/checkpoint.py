@@ -82,6 +82,8 @@ class Checkpoints:
       keep: how many of the newest stay.
       better: which held-out scores are better, to keep the best checkpoint too; `None` if checkpoints have no score.
       print_: receives a line about each damaged checkpoint that is skipped; standard error by default.
+      of: what the checkpoints say that they are of; those of something else, or of another step, count as damaged.
+        Without it all are read.
 
     Raises:
       CheckpointError: the directory cannot be read or written.
@@ -94,10 +96,11 @@ class Checkpoints:
         *,
         better: Literal["higher", "lower"] | None = None,
         print_: Callable[[str], None] = _complain,
+        of: str = "",
     ) -> None:
         if keep < 1:
             raise ValueError(f"keep is {keep}: must be at least 1; raise it")
-        self._directory, self._better, self._print = directory.absolute(), better, print_
+        self._directory, self._better, self._print, self._of = directory.absolute(), better, print_, of
         self._saving: int | None = None
         self._best: tuple[int, float] | None = None
         policy = LatestN(keep)
@@ -155,7 +158,8 @@ class Checkpoints:
         state = jax.tree.map(jnp.copy, state)
         if score is not None and self._is_best(score):
             self._best = step, score
-        held = {"data": data, "digests": _digests(state)} | ({"best": self._best} if self._better else {})
+        held = {"data": data, "digests": _digests(state), "of": self._label(step)}
+        held |= {"best": self._best} if self._better else {}
         args = ocp.args.Composite(
             state=ocp.args.StandardSave(state), data=ocp.args.JsonSave(held | {"crc32": _crc32(held)})
         )
@@ -272,11 +276,17 @@ class Checkpoints:
             raise DamagedCheckpointError(f"{where} cannot be read ({_brief(error)})") from error
         if not intact:
             raise DamagedCheckpointError(f"{where}: the checksum of its data does not hold")
+        label = self._label(step)  # in a checkpoint of an earlier version there is none
+        if self._of and held.get("of", label) != label:
+            raise DamagedCheckpointError(f"{where} is of {held['of']}: must be of {label}")
         changed = [name for name, value in _digests(found.state).items() if digests.get(name) != value]
         if changed:
             raise DamagedCheckpointError(f"{where}: the digest of {', '.join(changed)} does not hold")
         best = held.get("best") or self._ranked()
         return Restored(step, found.state, data, None if best is None else (best[0], best[1]))
+
+    def _label(self, step: int) -> str:
+        return f"{self._of} step {step}".strip()
 
     def _ranked(self) -> tuple[int, float] | None:
         """The best by Orbax's scores, for checkpoints of earlier versions, which do not name it."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from experiments.core.artifacts import DamagedFileError, UnwrittenError, jsonable
+from experiments.core.artifacts import DamagedFileError, UnwrittenError, jsonable, write_json
 from experiments.core.metric_log import MetricLog, read_metrics
 from experiments.core.progress import Loop, show_progress
 from experiments.faults.fixtures import full_disk
@@ -160,6 +160,20 @@ def test_a_stage_is_done_once_it_is_saved_and_again_where_its_result_is_damaged(
         with pytest.raises(DamagedFileError, match="checksum"):
             context.load_stage("sft/0")
     assert "stage sft/0 is done again" in context.console.file.getvalue()
+
+
+def test_a_stage_and_arrays_of_another_name_or_run_are_made_again(context):
+    for name in ("sft/0", "sft/1"):
+        context.save_stage(name, name)
+        context.cached_arrays(name, lambda name=name: {"a": np.array(name)})
+    for folder, end in ((context.directory / "stages", "json"), (context.cache_dir, "npz")):
+        (folder / f"sft/1.{end}").rename(folder / f"sft/0.{end}")
+    assert context.cached_arrays("sft/0", lambda: {"a": np.array(7)}) == {"a": 7}
+    assert context.once("sft/0", lambda: 7) == 7
+    assert "stage sft/0 is done again" in context.console.file.getvalue()
+    about = {"experiment": "", "scale": "", "command": "", "git": {"commit": "", "dirty": False}}
+    write_json(context.directory / "config.json", about | {"config": {"steps": 9}})  # of another run
+    assert context.once("sft/0", lambda: 8) == 8
 
 
 def test_stages_and_lines_of_earlier_versions_have_no_checksum_and_are_read(context):

@@ -12,13 +12,16 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from experiments.core.artifacts import write_arrays
 from experiments.core.context import Context
 from experiments.core.runs import ROOT
-from experiments.study.cache import LATER, NEVER, USED, fingerprint, source_digest
+from experiments.study.cache import LATER, NEVER, USED, fingerprint, read_policy, source_digest
 from experiments.study.seed import StudySeed
 from experiments.study.stages import EncodedContacts, make_arm
+from sensors_io.arrays import ArraysError
 from sensors_io.records import RecordStore
 from tests.experiments import tiny
+from tests.sensors_io.checks import refused
 from touchr1_jax.training.loop import LoopConfig
 
 CONFIG = tiny.STUDY.sft  # whose program other tests compile too
@@ -75,6 +78,12 @@ def test_a_damaged_file_of_the_cache_is_made_again(sft, first, home):
     jax.tree.map(np.testing.assert_array_equal, params, first[0])
     assert np.load(path).files == np.load(io.BytesIO(whole)).files
     assert sft("found again")[0].keys() == params.keys()
+
+
+def test_a_policy_of_another_hash_is_not_taken(tmp_path):
+    made = {"metrics": np.frombuffer(b"[]", np.uint8), "w": np.ones(2)}
+    write_arrays(tmp_path / "0.npz", made, of="1")
+    refused(ArraysError, "is of 1: must be of 0", read_policy, tmp_path / "0.npz")
 
 
 @pytest.mark.long

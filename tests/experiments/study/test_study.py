@@ -6,7 +6,9 @@ import jax
 import numpy as np
 import pytest
 
+from experiments.core.artifacts import write_arrays, write_json
 from experiments.core.runner import main
+from experiments.core.runs import FIELDS
 from experiments.study.answers import load_answers, save_answers
 from experiments.study.scores import (
     PUBLISHED,
@@ -20,8 +22,10 @@ from experiments.study.scores import (
 )
 from experiments.study.stages import ProbeFeatures
 from experiments.study.study import CONTINUED, SFT, Study, StudyConfig, check_arms, run_study
+from sensors_io.arrays import ArraysError
 from sensors_io.schema import SENSORS
 from tests.experiments import tiny
+from tests.sensors_io.checks import refused
 from touchr1_jax.models.layers import SizeError
 from touchr1_jax.models.touch_policy import ModelConfig, check_model
 from touchr1_jax.rewards import Reward, RewardError
@@ -94,6 +98,19 @@ def test_answers_survive_the_disk(tmp_path, alone):
         assert a.dtype == b.dtype
         assert np.array_equal(a, b)
     assert [p.name for p in path.parent.iterdir()] == ["sft-0.npz"]
+
+
+@pytest.mark.parametrize("name", ["run/answers/sft-1.npz", "run/answers/paper-0.npz", "other/answers/sft-0.npz"])
+def test_answers_of_another_policy_seed_or_run_are_not_taken(tmp_path, name):
+    git = {"commit": "", "dirty": False}
+    for run, steps in (("run", 9), ("other", 8)):
+        write_json(tmp_path / run / "config.json", dict.fromkeys(FIELDS, "") | {"config": {"steps": steps}, "git": git})
+    mine = tmp_path / "run" / "answers" / "sft-0.npz"
+    save_answers(mine, answers_about(TEST))
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    refused(ArraysError, "put its own copy back", load_answers, mine.rename(tmp_path / name))
+    write_arrays(mine, {"contact": np.zeros(3)})
+    refused(ArraysError, "lacks attribute", load_answers, mine)
 
 
 def test_the_joint_mode_is_that_of_whole_rows():

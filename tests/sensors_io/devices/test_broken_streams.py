@@ -1,6 +1,7 @@
 """Messages that break a protocol end no stream and are counted once."""
 
 import contextlib
+import dataclasses
 import socket
 import struct
 import time
@@ -111,6 +112,14 @@ def test_an_old_number_after_a_silence_is_a_duplicate():
     for number, time_ms in [*((n, 30 * n) for n in range(10)), (8, 800), (11, 830), (12, 860)]:
         intake.offer(sample(number, time_ms=time_ms))
     assert (intake.counts.restarts, intake.counts.duplicates, intake.counts.missing) == (0, 1, 1)
+
+
+def test_a_clock_that_stands_still_is_named_once():
+    intake = Intake(capacity=99, clock=JumpingClock())
+    samples = [dataclasses.replace(sample(k, time_ms=33 * k), device_time_ns=0) for k in range(90)]
+    with pytest.warns(WrongRateWarning, match="fall behind") as told:
+        [intake.offer(one) for one in samples]
+    assert len(told) == 1
 
 
 def test_a_layout_of_spaces_is_read_in_linear_time():

@@ -48,7 +48,10 @@ def test_an_overflowing_ring_counts_what_it_overwrites_and_says_so():
     assert intake.overloaded
     with pytest.warns(OverloadWarning, match="6 samples were overwritten"):
         assert intake.next(0.0).index == 6
-    assert [s.index for s in drain(intake)] == [7, 8, 9]
+    assert intake.overloaded
+    assert intake.next(0.0).index == 7
+    assert not intake.overloaded  # half of the ring waits
+    assert [s.index for s in intake.drain()] == [8, 9]
     counts = intake.counts
     assert (counts.arrived, counts.delivered, counts.overwritten, counts.unaccounted) == (10, 4, 6, 0)
 
@@ -72,8 +75,10 @@ def test_fresh_waits_for_a_sample_grabbed_after_the_call():
     assert intake.fresh(5.0).index == 1
     later.join()
     time.sleep(0.005)
+    asked_s = time.monotonic()
     with pytest.raises(DeviceTimeoutError):
         intake.fresh(0.01)
+    assert time.monotonic() - asked_s >= 0.01
 
 
 def test_losses_by_the_counter():

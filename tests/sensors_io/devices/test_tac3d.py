@@ -104,6 +104,7 @@ def empty(height, width):
         (empty(2**32, 2**32), b"", "are not 0 bytes"),  # whose product is 0 in 64 bits
         (empty(0, 10**30), b"", "are not 0 bytes"),
         (GOOD.replace(b"index: 10", b"index: ten"), b"\0" * 24, "lacks a readable index"),
+        (GOOD.replace(b"index: 10", b"index: -9223372036854775808"), b"\0" * 24, "must be within ±2"),
         (b"index: 1\nSN: x\ntimestamp: 2\ndata:\n", b"", "lists no array"),
         (b"index: 1\nSN: x\ntimestamp: 2\ndata: \xff\n", b"", "lists no array"),
     ],
@@ -204,6 +205,7 @@ def test_an_incomplete_recording_is_refused(tmp_path):
         {"sendTimestamp": np.array([0, 1e12, 2e12])},
         {"sendTimestamp": np.array(["a", "b", "c"])},
         {"index": np.array([0, np.nan, 1])},
+        {"index": np.array([0, 0.03, 0.06])},  # the file of the times in its place
         {"index": np.array(["a", "b", "c"])},
         {"index": np.array([1, 2, 2**63], np.uint64)},
         {"3D_ResultantForce": np.full((3, 1, 3), "a")},

@@ -84,11 +84,12 @@ BALL = entry("ball")
         ([{key: value for key, value in BALL.items() if key != "bumps"}], "'bumps'"),
         ([BALL, entry("ball", videos=0)], "object 'ball' appears twice"),
         ([BALL, entry("cup") | {"videos": ["ball_0.avi"]}], "video 'ball_0.avi' appears twice; splits"),
-        (None, "correct the entry"),
+        ("{", "correct the entry"),
+        ('{"objects": [{"object": "ball", "object": "cup"}]}', "'object' stands there twice"),
     ],
 )
 def test_labels_that_cannot_be_used_are_named(tmp_path, items, message):
-    labels(tmp_path, *items) if items else (tmp_path / "labels.json").write_text("{")
+    (tmp_path / "labels.json").write_text(items) if isinstance(items, str) else labels(tmp_path, *items)
     refused(ImportSourceError, message, read_labels, tmp_path / "labels.json")
 
 

@@ -262,6 +262,14 @@ def test_forces_and_moments_past_16_bits_are_kept(tmp_path):
     assert not (made.flags & np.uint32(Flag.INCOMPLETE)).any()
 
 
+@pytest.mark.parametrize(("kind", "stream"), [("frame", 1), ("frame", "0"), ("picture", 0)])
+def test_a_journal_with_an_entry_that_nothing_reads_is_named(tmp_path, kind, stream):
+    with JournalWriter(tmp_path / "a.journal") as journal:
+        journal.append("start", {"streams": [{"identity": {}}], "key": {}})
+        journal.append(kind, {"stream": stream, "time_ns": 1, "index": 0})
+    refused(JournalError, f"another layout .*{kind}", assemble, tmp_path / "a.journal")
+
+
 @pytest.mark.parametrize(
     ("start", "said"),
     [

@@ -140,6 +140,20 @@ class TestDamage:
         assert found.data == {"at": 1}
         assert "the checksum of data/metadata does not hold" in told[0]
 
+    @pytest.mark.parametrize(("source", "left"), [("mine", 1), ("other", 2)])
+    def test_a_whole_checkpoint_of_another_step_or_stage_does_not_pass(self, tmp_path, source, left):
+        for of in ("mine", "other"):
+            with Checkpoints(tmp_path / of, of=of) as checkpoints:
+                for n in (1, 2):
+                    checkpoints.save(n, self.numbers(n), None)
+        (tmp_path / source / "2").rename(tmp_path / "mine" / "3")
+        told: list[str] = []
+        with Checkpoints(tmp_path / "mine", print_=told.append, of="mine") as checkpoints:
+            assert checkpoints.restore(self.numbers(0)).step == left
+        assert f"is of {source} step 2: must be of mine step 3" in told[0]
+        with Checkpoints(tmp_path / "mine") as checkpoints:
+            assert checkpoints.restore(self.numbers(0)).step == left
+
     def test_a_flipped_bit_of_any_file_does_not_pass(self, stage):
         """Of a few places of each, its checksums among them, before Orbax reads anything."""
         files = [p for p in sorted((stage / "2").rglob("*")) if p.is_file() and p.name not in UNREAD]
