@@ -65,6 +65,18 @@ def test_messages_of_a_program_that_still_starts_are_no_samples(vendor):
         assert {device.read(5.0).index % 2 for _ in range(4)} == {0}
 
 
+def test_messages_that_came_while_a_reader_was_held_up_are_read(vendor):
+    """Of more than one datagram, with no time left: they were taken for silence, and lost with the socket."""
+    sender, port = vendor
+    with contextlib.ExitStack() as stack:
+        with sent(sender, message()):
+            device = stack.enter_context(listening(port))
+        for datagram in message()(10**6):
+            sender.send(datagram)
+        while device.read(0.0).index < 10**6:
+            pass
+
+
 def test_two_programs_on_one_port_do_not_mix():
     assembler = tac3d_messages.Assembler()
     a, b = datagrams(FINE, number=1, serial="A"), datagrams(FINE, number=1, serial="B")
