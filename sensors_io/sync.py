@@ -169,6 +169,7 @@ class PeriodGaps:
         e = t − φ − k T,   φ ← φ + k T + e / 8,   T ← T + e / (256 k)
 
     so that a sample that is more than half a period late counts one as missing, and the next, on time, takes it back.
+    A device that sends faster than it is said to sends samples that take back none, and soon a second of them.
 
     Args:
       period_ns: time between two samples, to 5 %.
@@ -183,6 +184,13 @@ class PeriodGaps:
             raise ValueError(f"period_ns is {period_ns}: must be > 0; give 10⁹ over the frame rate")
         self._nominal_ns = self._period_ns = float(period_ns)
         self._phase_ns: float | None = None
+        self._counted = 0  # as missing, less those taken back
+        self._extra = 0  # samples that came early and took back none
+
+    @property
+    def fast(self) -> bool:
+        """True if the device has sent a second of samples more than its period gives."""
+        return self._extra * self._nominal_ns > NS_PER_S
 
     def shift(self, by_ns: int) -> None:
         """Take note that the clock of the stamps was set forward by so much since the last sample."""
@@ -203,4 +211,7 @@ class PeriodGaps:
                 max(period, self._nominal_ns * (1 - self._DRIFT)), self._nominal_ns * (1 + self._DRIFT)
             )
             return _NEXT
-        return CounterStep(missing=max(count - 1, -1))
+        missing = max(count - 1, -min(1, self._counted))
+        self._counted += missing
+        self._extra += count < 1 and not missing
+        return CounterStep(missing=missing)

@@ -99,7 +99,7 @@ class Intake:
         self._period_gaps: PeriodGaps | None = None
         self._stamps: tuple[int, int] | None = None  # of the last sample, on the device's clock and on the host's
         self._repeated_ns: int | None = None  # arrival of the first repeated number since the last new one
-        self._away = False
+        self._away = self._told_fast = False
         self._broken_since = 0  # the last whole sample
         self._warned_at = 0
 
@@ -282,6 +282,14 @@ class Intake:
             return by_index if sample.index is not None else CounterStep()
         anew = by_index.restarted and sample.index is not None
         by_period = self._by_period(self._period_gaps, sample, anew)
+        if sample.index is None and self._period_gaps.fast and not self._told_fast:
+            self._told_fast = True
+            warnings.warn(
+                f"{self._device} sends faster than the rate that it is said to have, by which its losses are counted: "
+                "they are counted too low; state its rate, as with --rate-hz",
+                WrongRateWarning,
+                stacklevel=3,
+            )
         if not by_index.restarted:
             return by_index
         return dataclasses.replace(by_period, restarted=anew)

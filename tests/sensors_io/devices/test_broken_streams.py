@@ -1,5 +1,6 @@
 """Messages that break a protocol end no stream and are counted once."""
 
+import collections
 import contextlib
 import socket
 import struct
@@ -10,6 +11,7 @@ import pytest
 
 from sensors_io.clock import JumpingClock
 from sensors_io.devices import tac3d_messages
+from sensors_io.devices.base import Identity
 from sensors_io.devices.errors import DeviceDataError, TwoSendersWarning, WrongRateWarning
 from sensors_io.devices.intake import Intake
 from sensors_io.devices.netft import _RateCheck
@@ -123,6 +125,17 @@ def test_an_old_number_after_a_silence_is_a_duplicate():
     for number, time_ms in [*((n, 30 * n) for n in range(10)), (8, 800), (11, 830), (12, 860)]:
         intake.offer(sample(number, time_ms=time_ms))
     assert (intake.counts.restarts, intake.counts.duplicates, intake.counts.missing) == (0, 1, 1)
+
+
+@pytest.mark.parametrize("hz", [40, 50, 100])
+def test_a_device_that_sends_faster_than_it_is_said_to_loses_no_less_than_nothing(hz):
+    """Said to send at 32 Hz, without a number: each sample beyond that took back a loss that there had not been."""
+    intake = Intake(capacity=999, clock=JumpingClock())
+    intake.opened(Identity(sensor="digit", period_s=1 / 32))
+    times = [1000 * k // hz for k in range(10 * hz)]
+    with pytest.warns(WrongRateWarning, match="digit sends faster than the rate") as told:
+        collections.deque((intake.offer(sample(time_ms=ms)) for ms in times), maxlen=0)
+    assert (len(told), intake.counts.missing) == (1, 0)
 
 
 def test_a_layout_of_spaces_is_read_in_linear_time():
