@@ -76,6 +76,8 @@ def _assembled(start: Mapping[str, Any], entries: Seq[JournalEntry], torn: int) 
     ]
     if not any(frames):
         return None
+    if end and end["complete"]:
+        frames[0] = _with_force(frames[0], entries)
     backgrounds = _backgrounds(start, [entries[0], *ends])
     shared = _Shared(
         start=start,
@@ -99,6 +101,14 @@ def _span_ns(entries: Seq[JournalEntry]) -> tuple[int, int]:
     frames = [e.plain["time_ns"] for e in entries if e.kind == "frame"]
     force = [int(e.arrays["time_ns"][-1]) for e in entries if e.kind == "force"]
     return min(phases or frames), max(phases + frames + force)
+
+
+def _with_force(frames: Seq[JournalEntry], entries: Seq[JournalEntry]) -> Seq[JournalEntry]:
+    """Frames of a complete contact less those before the first reading of the force sensor or after the last, if any."""
+    times = [e.arrays["time_ns"] for e in entries if e.kind == "force"]
+    if not times:
+        return frames
+    return [f for f in frames if times[0][0] <= f.plain["time_ns"] <= times[-1][-1]] or frames
 
 
 def background_name(key: ContactKey, sensor: str) -> pathlib.Path:

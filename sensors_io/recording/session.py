@@ -177,7 +177,7 @@ class _Session:
         self._show, self._stop, self._book, self._region_px = show, stop, book, region_px
         self._leads: Stream | None = None
         self._alarm = ""
-        self._force_ns: tuple[int, int] | None = None  # times of its first reading and of its last
+        self._force_ns: int | None = None  # time of its last reading
 
     def contact(self, stage: ContactStage, key: ContactKey) -> None:
         """Record one contact from the prompt to the records."""
@@ -236,19 +236,10 @@ class _Session:
             touched = advice is None or abs(advice.normal_n) >= self._config.coach.touch_n
         for stream, samples in zip(self._streams, looked, strict=True):
             stream.refresh(samples, touched=touched)
-            covered = self._covered(stream, samples, over=advice is not None and advice.done)
             if recording:
-                stream.journal(covered, journal)
+                stream.journal(samples, journal)
             else:
-                stream.keep(covered)
-
-    def _covered(self, stream: Stream, samples: list[Sample], *, over: bool) -> list[Sample]:
-        """Frames since the first reading of the force sensor and, of a contact that is over, up to its last."""
-        if self._force is None or self._force_ns is None:
-            return samples if self._force is None else []
-        first_ns, last_ns = self._force_ns
-        times = stream.time_ns(samples)
-        return [s for s, t in zip(samples, times, strict=True) if t >= first_ns and (t <= last_ns or not over)]
+                stream.keep(samples)
 
     def _forces(self, looked: Seq[list[Sample]], journal: JournalWriter) -> tuple[np.ndarray, np.ndarray]:
         """Times [n] and forces [n, 3] on the gel: the force sensor's, else those that a tactile sensor tells."""
@@ -288,10 +279,9 @@ class _Session:
 
     def _watch(self, times: np.ndarray, looked: Seq[list[Sample]]) -> None:
         """Raise the alarm if the pictures go on and the force does not: the prompt is that of its last reading."""
-        if len(times):
-            self._force_ns = int(times[0]) if self._force_ns is None else self._force_ns[0], int(times[-1])
+        self._force_ns = int(times[-1]) if len(times) else self._force_ns
         seen_ns = max((samples[-1].host_time_ns for samples in looked if samples), default=0)
-        if self._force_ns is not None and seen_ns - self._force_ns[1] > _SILENT_S * NS_PER_S:
+        if self._force_ns is not None and seen_ns - self._force_ns > _SILENT_S * NS_PER_S:
             self._alarm = "the force sensor is silent: release, and look at its connection"
 
     def _start(self, key: ContactKey, stage: ContactStage) -> dict[str, Any]:
