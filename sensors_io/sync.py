@@ -40,13 +40,16 @@ class ClockMap:
         self.restarts = 0
         self.slow = False
 
-    def to_host_ns(self, device_ns: int, host_ns: int) -> int:
+    def to_host_ns(self, device_ns: int, host_ns: int, *, late: bool = False) -> int:
         """When a sample was taken, on the host's clock; never after it arrived.
 
         Args:
           device_ns: stamp of the sample on the device's clock; one that goes back says that the device restarted.
           host_ns: when it arrived; must not decrease from call to call.
+          late: by its number it was taken before the last one, so that its stamp may go back.
         """
+        if late and self._rising and not self.slow:
+            return min(device_ns + self._rising[0][1], host_ns)
         if self._last_device_ns is not None and device_ns < self._last_device_ns:
             self._rising.clear()
             self._second, self.slow = None, False
