@@ -104,7 +104,7 @@ def _span_ns(entries: Seq[JournalEntry]) -> tuple[int, int]:
 
 
 def _with_force(frames: Seq[JournalEntry], entries: Seq[JournalEntry]) -> Seq[JournalEntry]:
-    """Frames of a complete contact less those before the first reading of the force sensor or after the last, if any."""
+    """Frames of a complete contact less those before the first reading of the force sensor and after the last."""
     times = [e.arrays["time_ns"] for e in entries if e.kind == "force"]
     if not times:
         return frames
