@@ -137,7 +137,7 @@ class IndexGaps:
         if self._last is None:
             self._last = index
             return _NEXT
-        ahead = self._ahead(index, self._last)
+        ahead = index - self._last if reopened else self._ahead(index, self._last)
         if ahead >= 1:
             self._remember(self._last + 1, ahead - 1)
             self._last = index
@@ -188,7 +188,7 @@ class PeriodGaps:
         self._nominal_ns = self._period_ns = float(period_ns)
         self._phase_ns: float | None = None
         self._counted = 0  # as missing, less those taken back
-        self._extra = 0  # samples that came early and took back none
+        self._early = self._extra = 0  # samples that came early and took back none: since the last on time, and ever
 
     @property
     def fast(self) -> bool:
@@ -213,8 +213,15 @@ class PeriodGaps:
             self._period_ns = min(
                 max(period, self._nominal_ns * (1 - self._DRIFT)), self._nominal_ns * (1 + self._DRIFT)
             )
+            self._early = 0
             return _NEXT
-        missing = max(count - 1, -min(1, self._counted))
+        if count < 1:
+            missing = -min(1, self._counted)
+            came_early = 1 + missing
+        else:
+            came_early = -min(count - 1, self._early)  # behind samples that came early there is a gap
+            missing = count - 1 + came_early
+        self._early += came_early
+        self._extra += came_early
         self._counted += missing
-        self._extra += count < 1 and not missing
         return CounterStep(missing=missing)
