@@ -207,7 +207,8 @@ class PeriodGaps:
             return _NEXT
         count = round((time_ns - self._phase_ns) / self._period_ns)
         error = time_ns - self._phase_ns - count * self._period_ns
-        self._phase_ns += count * self._period_ns + self._PHASE_GAIN * error
+        if count >= 0:  # the times of the host do not run back: a stamp that does is wrong
+            self._phase_ns += count * self._period_ns + self._PHASE_GAIN * error
         if count == 1:
             period = self._period_ns + self._PERIOD_GAIN * error
             self._period_ns = min(
