@@ -108,7 +108,8 @@ def _with_force(frames: Seq[JournalEntry], entries: Seq[JournalEntry]) -> Seq[Jo
     times = [e.arrays["time_ns"] for e in entries if e.kind == "force"]
     if not times:
         return frames
-    return [f for f in frames if times[0][0] <= f.plain["time_ns"] <= times[-1][-1]] or frames
+    inside = [i for i, f in enumerate(frames) if times[0][0] <= f.plain["time_ns"] <= times[-1][-1]]
+    return frames[inside[0] : inside[-1] + 1] if inside else frames
 
 
 def background_name(key: ContactKey, sensor: str) -> pathlib.Path:

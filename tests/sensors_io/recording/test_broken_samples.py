@@ -237,7 +237,12 @@ class Overlapping(Scale):
 
 
 def test_frames_before_the_first_force_and_after_the_last_of_a_contact_are_not_flagged(tmp_path):
-    """The force sensor is opened last, and sends its readings some at a time."""
+    """The force sensor is opened last and sends some readings at a time; one frame has a wrong stamp, and stays."""
+
+    class Stale(Camera):
+        def drain(self):
+            early_ns = 5 * 10**9 if self.count == 30 else 0
+            return [dataclasses.replace(s, host_time_ns=s.host_time_ns - early_ns) for s in super().drain()]
 
     class Buffered(Scale):
         held = ()
@@ -250,9 +255,10 @@ def test_frames_before_the_first_force_and_after_the_last_of_a_contact_are_not_f
             return held[:whole]
 
     hand = Hand()
-    record_session(tmp_path, FREE, [Camera(hand)], Buffered(hand), show=hand.show)
+    record_session(tmp_path, FREE, [Stale(hand)], Buffered(hand), show=hand.show)
     made = RecordStore(tmp_path).contact(0)["gelsight_mini"]
-    assert not made.flags.any()
+    assert np.flatnonzero(made.flags).tolist() == np.flatnonzero(np.diff(made.host_time_ns, prepend=0) < 0).tolist()
+    assert len(np.flatnonzero(made.flags)) == 1
     assert len(made) > 45
 
 
