@@ -103,7 +103,7 @@ def _span_ns(entries: Seq[JournalEntry]) -> tuple[int, int]:
     return min(phases or frames), max(phases + frames + force)
 
 
-def _with_force(frames: Seq[JournalEntry], entries: Seq[JournalEntry]) -> Seq[JournalEntry]:
+def _with_force(frames: list[JournalEntry], entries: Seq[JournalEntry]) -> list[JournalEntry]:
     """Frames of a complete contact less those before the first reading of the force sensor and after the last."""
     times = [e.arrays["time_ns"] for e in entries if e.kind == "force"]
     if not times:
