@@ -131,7 +131,7 @@ class ContactKey:
     trial: int
 
     def __post_init__(self) -> None:
-        _require_name("object_id", self.object_id)
+        require_name("object_id", self.object_id)
         _require(self.motion in MOTIONS, "motion", self.motion, f"must be one of {', '.join(MOTIONS)}", "rename it")
         for name in ("site", "trial"):
             number = getattr(self, name)
@@ -169,7 +169,7 @@ class Sequence:
     contact_grid: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        _require_name("sensor", self.sensor)
+        require_name("sensor", self.sensor)
         check_arrays(FRAME_ARRAYS, {name: getattr(self, name) for name in FRAME_ARRAYS}, where=f"{self.name}")
         seen = self.frames is not None or self.deformation_mm is not None or self.depth_mm is not None
         _require(seen, "frames", None, "a sequence needs camera frames or fields", "store at least one of them")
@@ -212,7 +212,7 @@ class ObjectCard:
     name: str = ""
 
     def __post_init__(self) -> None:
-        _require_name("object_id", self.object_id)
+        require_name("object_id", self.object_id)
         _require(self.split in SPLITS, "split", self.split, f"must be one of {', '.join(SPLITS)}", "rename it")
         for attribute, level in self.labels.items():
             _require(attribute in LEVELS, "labels", attribute, f"must be one of {', '.join(ATTRIBUTES)}", "rename it")
@@ -280,6 +280,11 @@ def _require(ok: bool, field: str, value: object, constraint: str, fix: str) -> 
         raise SchemaError(f"{field} is {value!r}: {constraint}; {fix}")
 
 
-def _require_name(field: str, value: str) -> None:
+def require_name(field: str, value: str) -> None:
+    """Refuse what can name neither an object nor a sensor.
+
+    Raises:
+      SchemaError: it holds other characters than letters, digits, and `_.-`.
+    """
     ok = _NAME.fullmatch(value) is not None
     _require(ok, field, value, "must be letters, digits, '_', '.' or '-', starting with a letter or digit", "rename it")

@@ -40,13 +40,16 @@ class ClockMap:
         self.restarts = 0
         self.slow = False
 
-    def to_host_ns(self, device_ns: int, host_ns: int) -> int:
+    def to_host_ns(self, device_ns: int, host_ns: int, *, late: bool = False) -> int:
         """When a sample was taken, on the host's clock; never after it arrived.
 
         Args:
           device_ns: stamp of the sample on the device's clock; one that goes back says that the device restarted.
           host_ns: when it arrived; must not decrease from call to call.
+          late: by its number it was taken before the last one, so that its stamp may go back.
         """
+        if late and self._rising and not self.slow:
+            return min(device_ns + self._rising[0][1], host_ns)
         if self._last_device_ns is not None and device_ns < self._last_device_ns:
             self._rising.clear()
             self._second, self.slow = None, False
@@ -134,7 +137,7 @@ class IndexGaps:
         if self._last is None:
             self._last = index
             return _NEXT
-        ahead = self._ahead(index, self._last)
+        ahead = index - self._last if reopened else self._ahead(index, self._last)
         if ahead >= 1:
             self._remember(self._last + 1, ahead - 1)
             self._last = index
@@ -169,6 +172,7 @@ class PeriodGaps:
         e = t − φ − k T,   φ ← φ + k T + e / 8,   T ← T + e / (256 k)
 
     so that a sample that is more than half a period late counts one as missing, and the next, on time, takes it back.
+    A device that sends faster than it is said to sends samples that take back none, and soon a second of them.
 
     Args:
       period_ns: time between two samples, to 5 %.
@@ -183,6 +187,13 @@ class PeriodGaps:
             raise ValueError(f"period_ns is {period_ns}: must be > 0; give 10⁹ over the frame rate")
         self._nominal_ns = self._period_ns = float(period_ns)
         self._phase_ns: float | None = None
+        self._counted = 0  # as missing, less those taken back
+        self._early = self._extra = 0  # samples that came early and took back none: since the last on time, and ever
+
+    @property
+    def fast(self) -> bool:
+        """True if the device has sent a second of samples more than its period gives."""
+        return self._extra * self._nominal_ns > NS_PER_S
 
     def shift(self, by_ns: int) -> None:
         """Take note that the clock of the stamps was set forward by so much since the last sample."""
@@ -196,11 +207,22 @@ class PeriodGaps:
             return _NEXT
         count = round((time_ns - self._phase_ns) / self._period_ns)
         error = time_ns - self._phase_ns - count * self._period_ns
-        self._phase_ns += count * self._period_ns + self._PHASE_GAIN * error
+        if count >= 0:  # the times of the host do not run back: a stamp that does is wrong
+            self._phase_ns += count * self._period_ns + self._PHASE_GAIN * error
         if count == 1:
             period = self._period_ns + self._PERIOD_GAIN * error
             self._period_ns = min(
                 max(period, self._nominal_ns * (1 - self._DRIFT)), self._nominal_ns * (1 + self._DRIFT)
             )
+            self._early = 0
             return _NEXT
-        return CounterStep(missing=max(count - 1, -1))
+        if count < 1:
+            missing = -min(1, self._counted)
+            came_early = 1 + missing
+        else:
+            came_early = -min(count - 1, self._early)  # behind samples that came early there is a gap
+            missing = count - 1 + came_early
+        self._early += came_early
+        self._extra += came_early
+        self._counted += missing
+        return CounterStep(missing=missing)

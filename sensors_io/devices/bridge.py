@@ -14,6 +14,7 @@ what the sensors send a dozen times over: see `stability_devices`.
 import collections
 import dataclasses
 import json
+import math
 import os
 import pathlib
 import select
@@ -76,6 +77,8 @@ class BridgeConfig:
 
     def __post_init__(self) -> None:
         require_pitch(self.mm_per_px)
+        if not 0 <= self.rate_hz < math.inf:
+            raise ValueError(f"rate_hz is {self.rate_hz}: must be ≥ 0 and finite; correct it")
 
     def open(self) -> "Bridge":
         """The device, not open yet."""

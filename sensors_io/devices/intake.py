@@ -97,9 +97,10 @@ class Intake:
         self._device = "a device"
         self._index_gaps = IndexGaps()
         self._period_gaps: PeriodGaps | None = None
+        self._period_ns: int | None = None
         self._stamps: tuple[int, int] | None = None  # of the last sample, on the device's clock and on the host's
         self._repeated_ns: int | None = None  # arrival of the first repeated number since the last new one
-        self._away = False
+        self._away = self._told_fast = self._overtaken = False
         self._broken_since = 0  # the last whole sample
         self._warned_at = 0
 
@@ -112,7 +113,8 @@ class Intake:
             else:
                 self._index_gaps = IndexGaps(identity.counter_modulus)
                 period = identity.period_s
-                self._period_gaps = None if period is None else PeriodGaps(round(period * NS_PER_S))
+                self._period_ns = None if period is None else round(period * NS_PER_S)
+                self._period_gaps = None if self._period_ns is None else PeriodGaps(self._period_ns)
 
     def lost(self) -> None:
         """Take note that the device was lost."""
@@ -258,7 +260,8 @@ class Intake:
         counts = self._counts
         counts.restarts += step.restarted
         counts.late += step.late
-        if step.restarted or self._away:  # its clock may have begun anew too, though it reads more than before
+        self._overtaken = step.late and self._goes_on(sample)
+        if step.restarted or (self._away and not self._goes_on(sample)):  # its clock may have begun anew too
             self._clock_map = ClockMap()
         broken, self._broken_since = min(self._broken_since, max(step.missing, 0)), 0
         counts.missing += step.missing - step.late - broken
@@ -282,6 +285,14 @@ class Intake:
             return by_index if sample.index is not None else CounterStep()
         anew = by_index.restarted and sample.index is not None
         by_period = self._by_period(self._period_gaps, sample, anew)
+        if sample.index is None and self._period_gaps.fast and not self._told_fast:
+            self._told_fast = True
+            warnings.warn(
+                f"{self._device} sends faster than the rate that it is said to have, by which its losses are counted: "
+                "they are counted too low; state its rate, as with --rate-hz",
+                WrongRateWarning,
+                stacklevel=3,
+            )
         if not by_index.restarted:
             return by_index
         return dataclasses.replace(by_period, restarted=anew)
@@ -296,6 +307,17 @@ class Intake:
             if anew or stamp < last[0] or abs(moved) > _CLOCK_SET_NS:
                 gaps.shift(moved)
         return gaps.step(stamp)
+
+    def _goes_on(self, sample: Sample) -> bool:
+        """True if number and stamp went on, or back, by as many periods: neither counter nor clock began anew."""
+        last = self._newest
+        if last is None or self._period_ns is None or sample.index is None or last.index is None:
+            return False
+        if sample.device_time_ns is None or last.device_time_ns is None:
+            return False
+        steps = sample.index - last.index
+        apart_ns = sample.device_time_ns - last.device_time_ns - steps * self._period_ns
+        return abs(apart_ns) <= self._period_ns * (1 + abs(steps) / 20)
 
     def _same_picture(self, sample: Sample) -> bool:
         """True if a picture without a counter repeats the last one: sensor noise never repeats itself."""
@@ -313,7 +335,7 @@ class Intake:
         if sample.device_time_ns is None:
             return sample
         before = self._clock_map.slow
-        mapped = self._clock_map.to_host_ns(sample.device_time_ns, sample.host_time_ns)
+        mapped = self._clock_map.to_host_ns(sample.device_time_ns, sample.host_time_ns, late=self._overtaken)
         if self._clock_map.slow and not before:
             warnings.warn(
                 f"{self._device}: its stamps fall behind this machine's clock, and its samples come late by them: they "

@@ -193,6 +193,8 @@ class NetFt:
         self._calibration: NetFtScale | None = None
         self._records: deque[tuple[int, bool, bytes]] = deque()
         self._rate = _RateCheck(config.rate_hz)
+        self._first_opened_ns: int | None = None
+        self._began_ns = 0  # of its numbers, which may begin anew whenever it is opened; since it was first opened
 
     @property
     def identity(self) -> Identity:
@@ -207,6 +209,9 @@ class NetFt:
     def __enter__(self) -> Self:
         c = self._config
         self._rate = _RateCheck(c.rate_hz)
+        now_ns = time.monotonic_ns()
+        self._first_opened_ns = now_ns if self._first_opened_ns is None else self._first_opened_ns
+        self._began_ns = now_ns - self._first_opened_ns
         try:
             self._calibration = parse_calibration(self._ask_calibration())
             self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -238,12 +243,11 @@ class NetFt:
             raise DeviceDataError(f"NetFT record {number} has status {status:#010x}: {_meaning(status)}")
         assert self._calibration is not None
         values = np.array(counts, np.float64)
+        period_ns = NS_PER_S / self._config.rate_hz
         self._check_rate(number, stamp_ns, waited)
         return Sample(
             host_time_ns=stamp_ns,
-            device_time_ns=(
-                None if self._rate.measured_hz is not None else round(number * NS_PER_S / self._config.rate_hz)
-            ),
+            device_time_ns=None if self._rate.measured_hz is not None else self._began_ns + round(number * period_ns),
             index=number,
             arrays={
                 "force_n": (values[:3] / self._calibration.counts_per_n).astype(np.float32),

@@ -157,13 +157,10 @@ class Tac3dSensor:
     def _receive(self, deadline: float, timeout_s: float, starting: str) -> tuple[bytes, tuple[str, int]]:
         if self._socket is None:
             raise DeviceLostError("Tac3D is not open; use it in a with block")
-        left = deadline - time.monotonic()
         try:
-            if left <= 0:
-                raise TimeoutError
-            self._socket.settimeout(left)
+            self._socket.settimeout(max(deadline - time.monotonic(), 0.0))  # what has come is read, however late
             return self._socket.recvfrom(_LARGEST)
-        except TimeoutError as silence:
+        except (TimeoutError, BlockingIOError) as silence:
             raise DeviceTimeoutError(
                 f"Tac3D sent no whole message in {timeout_s:g} s{starting}; look at the vendor's program"
             ) from silence

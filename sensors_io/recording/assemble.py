@@ -79,6 +79,8 @@ def _assembled(start: Mapping[str, Any], entries: Seq[JournalEntry], torn: int) 
     frames = [[e for e in entries if e.kind == "frame" and e.plain["stream"] == i] for i in streams]
     if not any(frames):
         return None
+    if end and end["complete"]:
+        frames[0] = _with_force(frames[0], entries)
     backgrounds = _backgrounds(start, [entries[0], *ends])
     shared = _Shared(
         start=start,
@@ -102,6 +104,15 @@ def _span_ns(entries: Seq[JournalEntry]) -> tuple[int, int]:
     frames = [e.plain["time_ns"] for e in entries if e.kind == "frame"]
     force = [int(e.arrays["time_ns"][-1]) for e in entries if e.kind == "force"]
     return min(phases or frames), max(phases + frames + force)
+
+
+def _with_force(frames: list[JournalEntry], entries: Seq[JournalEntry]) -> list[JournalEntry]:
+    """Frames of a complete contact less those before the first reading of the force sensor and after the last."""
+    times = [e.arrays["time_ns"] for e in entries if e.kind == "force"]
+    if not times:
+        return frames
+    inside = [i for i, f in enumerate(frames) if times[0][0] <= f.plain["time_ns"] <= times[-1][-1]]
+    return frames[inside[0] : inside[-1] + 1] if inside else frames
 
 
 def background_name(key: ContactKey, sensor: str) -> pathlib.Path:

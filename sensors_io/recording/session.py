@@ -27,7 +27,7 @@ from sensors_io.recording.coach import Advice, Coach, CoachConfig, ContactStage,
 from sensors_io.recording.journal import JournalWriter
 from sensors_io.recording.streams import SampleReader, Stream, StreamStatus
 from sensors_io.records import RecordsMeta, RecordWriter
-from sensors_io.schema import MOTIONS, ContactKey, Phase, SchemaError
+from sensors_io.schema import MOTIONS, ContactKey, Phase, SchemaError, require_name
 
 _UNTOUCHED_S = 10.0  # of a pause before the first touch the last 10 to 20 s are kept: contacts are stored from memory
 _NAME_BYTES = 255  # of a file, in the common file systems
@@ -107,13 +107,13 @@ def record_session(
 
     Raises:
       RecordsError: the records are another data set's, of other sensors, or are being written.
-      SchemaError: no sensor, or two of one name.
+      SchemaError: no sensor, two of one name, or one that no file can be named by.
       ForceError: nothing tells the force that the protocol is led by.
       DeviceError: a device failed for good; what was recorded is in the records.
     """
     streams = tuple(Stream(i, feed, config.late_s.get(feed.identity.sensor, 0.0)) for i, feed in enumerate(tactile))
     for stream in streams:
-        _require_short_names(config, stream.sensor)
+        _require_names(config, stream.sensor)
     report = Report()
     with RecordWriter(out, meta=_meta(config, streams), resume=True) as writer:
         journals = out / JOURNALS
@@ -137,8 +137,9 @@ def _stages(config: SessionConfig) -> tuple[ContactStage, ...]:
     return (ContactStage(motion="free", force_n=0.0),) if config.free_s > 0 else config.stages
 
 
-def _require_short_names(config: SessionConfig, sensor: str) -> None:
+def _require_names(config: SessionConfig, sensor: str) -> None:
     """Refuse names of which a file could not be named before anything is recorded."""
+    require_name("sensor", sensor)
     key = ContactKey(object_id=config.object_id, site=config.site, motion=max(MOTIONS, key=len), trial=99)
     rest = len(background_name(key, sensor).with_suffix(".tmp.png").name) - len(config.object_id) - len(sensor)
     if len(config.object_id) + len(sensor) > _NAME_BYTES - rest:

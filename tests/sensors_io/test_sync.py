@@ -123,12 +123,22 @@ def test_a_late_sample_is_told_from_a_duplicate_and_a_restart():
     assert steps[4].duplicate
     assert steps[6].restarted
     assert not any(s.restarted for s in steps[:6])
+    gaps = IndexGaps(2**32)
+    gaps.step(3 * 10**9)
+    assert gaps.step(7, reopened=True).restarted  # and not 1.3 10⁹ ahead, around the end of the counter
 
 
 def test_periods_count_what_is_missing_and_take_back_what_was_late():
     gaps = PeriodGaps(10 * MS)
     times = [0, 10, 20, 50, 60, 76, 80, 90, 70]  # two lost before 50; 70 comes 6 ms late; in the end 20 ms back
     assert [gaps.step(t * MS).missing for t in times] == [0, 0, 0, 2, 0, 1, -1, 0, -1]
+
+
+def test_a_sample_that_comes_early_takes_back_no_loss_that_was_not_counted():
+    gaps = PeriodGaps(10 * MS)
+    times = [0, 10, 14, 30, 40, 40, 40, 70, -900, 90]  # 20 comes early, 50 and 60 with 40; the stamp of 80 is wrong
+    assert [gaps.step(t * MS).missing for t in times] == [0] * 10
+    assert not gaps.fast
 
 
 @pytest.mark.parametrize(("share", "followed"), [(0.92, 0.95), (1.02, 1.02), (1.08, 1.05)])

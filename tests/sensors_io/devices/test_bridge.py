@@ -37,6 +37,7 @@ def test_a_failing_sdk_says_its_last_words(monkeypatch, request):
     with pytest.raises(DeviceNotFoundError, match="does not start"), bridge.BridgeConfig(python="/nowhere").open():
         pass
     refused(DeviceLostError, "not open", lambda: config("3").open().read(0.1))
+    refused(ValueError, "rate_hz is -25.0: must be ≥ 0", lambda: config("3", rate_hz=-25.0))
 
 
 def test_damaged_frames_are_refused():

@@ -1,5 +1,6 @@
 """Messages that break a protocol end no stream and are counted once."""
 
+import collections
 import contextlib
 import dataclasses
 import socket
@@ -11,6 +12,7 @@ import pytest
 
 from sensors_io.clock import JumpingClock
 from sensors_io.devices import tac3d_messages
+from sensors_io.devices.base import Identity
 from sensors_io.devices.errors import DeviceDataError, TwoSendersWarning, WrongRateWarning
 from sensors_io.devices.intake import Intake
 from sensors_io.devices.netft import _RateCheck
@@ -64,6 +66,18 @@ def test_messages_of_a_program_that_still_starts_are_no_samples(vendor):
     starting = message({**FINE, "InitializeProgress": np.array([[40.0]])})
     with sent(sender, starting, message()), listening(port) as device:
         assert {device.read(5.0).index % 2 for _ in range(4)} == {0}
+
+
+def test_messages_that_came_while_a_reader_was_held_up_are_read(vendor):
+    """Of more than one datagram, with no time left: they were taken for silence, and lost with the socket."""
+    sender, port = vendor
+    with contextlib.ExitStack() as stack:
+        with sent(sender, message()):
+            device = stack.enter_context(listening(port))
+        for datagram in message()(10**6):
+            sender.send(datagram)
+        while device.read(0.0).index < 10**6:
+            pass
 
 
 def test_two_programs_on_one_port_do_not_mix():
@@ -120,6 +134,17 @@ def test_a_clock_that_stands_still_is_named_once():
     with pytest.warns(WrongRateWarning, match="fall behind") as told:
         [intake.offer(one) for one in samples]
     assert len(told) == 1
+
+
+@pytest.mark.parametrize("hz", [40, 50, 100])
+def test_a_device_that_sends_faster_than_it_is_said_to_loses_no_less_than_nothing(hz):
+    """Said to send at 32 Hz, without a number: each sample beyond that took back a loss that there had not been."""
+    intake = Intake(capacity=999, clock=JumpingClock())
+    intake.opened(Identity(sensor="digit", period_s=1 / 32))
+    times = [1000 * k // hz for k in range(10 * hz)]
+    with pytest.warns(WrongRateWarning, match="digit sends faster than the rate") as told:
+        collections.deque((intake.offer(sample(time_ms=ms)) for ms in times), maxlen=0)
+    assert (len(told), intake.counts.missing) == (1, 0)
 
 
 def test_a_layout_of_spaces_is_read_in_linear_time():

@@ -65,6 +65,16 @@ def test_counts_become_newtons_and_newton_millimetres():
     assert commands == [(HEADER, Command.STREAM, 0), (HEADER, Command.BIAS, 0), (HEADER, Command.STOP, 0)]
 
 
+def test_numbers_of_a_sensor_that_was_opened_again_have_times_of_their_own():
+    """Else those of one that was switched off and on could go on where the old ones ended, seconds too early."""
+    stamps = []
+    with sensor([record(5, *[0] * 6)]) as (config, _), config.open() as device:
+        stamps.append(device.read(5.0).device_time_ns)
+    with sensor([record(6, *[0] * 6)]) as (device._config, _), device:
+        stamps.append(device.read(5.0).device_time_ns)
+    assert stamps[1] - stamps[0] > 2_000_000
+
+
 def test_buffered_records_are_spread_over_their_periods():
     whole = b"".join(record(k, 0, 0, 0, 0, 0, 0) for k in range(40))
     with sensor([whole]) as (config, _), config.open() as device:

@@ -148,6 +148,20 @@ def test_a_counter_that_restarts_on_reconnecting_leaves_the_loss_to_the_clock(st
     assert [s.host_time_ns // MS for s in drain(intake)] == [40, 50, 110, 120]
 
 
+@pytest.mark.parametrize(
+    ("numbers", "arrival_ms", "lost_at"),
+    [([4, 5, 7, 6, 8], [40, 50, 70, 78, 80], None), ([4, 5, 6, 7, 8], [40, 50, 900, 901, 902], 2)],
+    ids=["overtaken", "held up for longer than a device may be silent"],
+)
+def test_late_samples_whose_stamps_go_with_their_numbers_have_their_own_times(numbers, arrival_ms, lost_at):
+    stamped = zip(numbers, arrival_ms, strict=True)
+    script = [sample(index, time_ms, device_time_ns=10 * index * MS) for index, time_ms in stamped]
+    if lost_at is not None:
+        script.insert(lost_at, DeviceLostError("x"))
+    got = drain(pumped(Scripted(script, period_s=0.01)))
+    assert [s.host_time_ns // MS for s in got] == [10 * n for n in numbers]
+
+
 @pytest.mark.parametrize("set_by_s", [-3600, 3600])
 def test_a_clock_that_is_set_during_a_recording_loses_and_moves_nothing(set_by_s):
     """Samples 3 and 4 are lost while the device's clock is set by an hour."""

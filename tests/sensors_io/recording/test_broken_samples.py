@@ -236,6 +236,32 @@ class Overlapping(Scale):
         return [dataclasses.replace(s, host_time_ns=s.host_time_ns - early_ns) for s in super().drain()]
 
 
+def test_frames_before_the_first_force_and_after_the_last_of_a_contact_are_not_flagged(tmp_path):
+    """The force sensor is opened last and sends some readings at a time; one frame has a wrong stamp, and stays."""
+
+    class Stale(Camera):
+        def drain(self):
+            early_ns = 5 * 10**9 if self.count == 30 else 0
+            return [dataclasses.replace(s, host_time_ns=s.host_time_ns - early_ns) for s in super().drain()]
+
+    class Buffered(Scale):
+        held = ()
+
+        def drain(self):
+            self.last_ns = max(self.last_ns, 10**9 + 50 * MS)
+            held = [*self.held, *super().drain()]
+            whole = len(held) // 20 * 20
+            self.held = held[whole:]
+            return held[:whole]
+
+    hand = Hand()
+    record_session(tmp_path, FREE, [Stale(hand)], Buffered(hand), show=hand.show)
+    made = RecordStore(tmp_path).contact(0)["gelsight_mini"]
+    assert np.flatnonzero(made.flags).tolist() == np.flatnonzero(np.diff(made.host_time_ns, prepend=0) < 0).tolist()
+    assert len(np.flatnonzero(made.flags)) == 1
+    assert len(made) > 45
+
+
 def test_forces_whose_times_overlap_are_kept(tmp_path):
     hand = Hand()
     record_session(tmp_path, FREE, [Camera(hand)], Overlapping(hand), show=hand.show)

@@ -287,6 +287,8 @@ def test_sensors_of_one_name_and_records_of_other_sensors_are_refused(tmp_path):
         record_session(tmp_path, SHORT, [Camera(hand), Camera(hand)], Scale(hand), show=hand.show)
     long = dataclasses.replace(SHORT, object_id="c" * 221)
     refused(SchemaError, "221 and 13 letters: must have at most 233 together", session, tmp_path / "x", hand, long)
+    with pytest.raises(SchemaError, match="sensor is 'my camera': must be letters"):
+        record_session(tmp_path / "x", SHORT, [Camera(hand, "my camera")], Scale(hand), show=hand.show)
     assert not (tmp_path / "x").exists()
     session(tmp_path, hand, SHORT)
     refused(RecordsExistError, r"recorded-2 gelsight_mini', not 'recorded-2 gelsight_mini\+tac3d'", both, tmp_path)
