@@ -24,6 +24,9 @@ GROUP = "group"
 SMALLEST_WEIGHT, LARGEST_WEIGHT = 1e-9, 1e9
 """Range of a weight above 0: squares of rewards stay within float32."""
 
+RESERVED = ("kl", "levels", "std", "tactile_use", "total")
+"""No names of rewards: a step has metrics and terms of its own called so."""
+
 
 class RewardError(ValueError):
     """A reward or a weight that does not fit; the message names it, its value, the constraint and the fix."""
@@ -178,10 +181,12 @@ def check_weights(rewards: Mapping[str, AnyReward], weights: Mapping[str, float]
     """Check the names and sizes of weights.
 
     Raises:
-      RewardError: an unknown name, an entry that is no `Reward`, a weight that is negative or beyond float32, or none
-        above 0.
+      RewardError: an unknown or reserved name, an entry that is no `Reward`, a weight that is negative or beyond
+        float32, or none above 0.
     """
     for name, weight in weights.items():
+        if name in RESERVED:
+            raise RewardError(f"weights: {name!r} is the name of a metric of the engine; call the reward otherwise")
         if name not in rewards:
             raise RewardError(f"weights: no reward is called {name!r}; choose from {', '.join(sorted(rewards))}")
         if not isinstance(rewards[name], AnyReward):

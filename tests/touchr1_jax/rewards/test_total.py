@@ -62,6 +62,7 @@ def test_every_reward_is_a_scalar(name):
     ("weights", "message"),
     [
         ({"acuracy": 1.0}, r"no reward is called 'acuracy'; choose from accuracy, accuracy_debiased, accuracy_strict"),
+        ({"kl": 1.0}, r"'kl' is the name of a metric of the engine; call the reward otherwise"),
         ({"accuracy": -1.0}, r"weights\[accuracy\] is -1\.0: must be finite and ≥ 0"),
         ({"accuracy": float("nan")}, r"weights\[accuracy\] is nan: must be finite"),
         ({"accuracy": 0.9e-9}, r"weights\[accuracy\] is 9e-10: must be finite and ≥ 0, and 1e-09 … "),
