@@ -305,10 +305,8 @@ def _execute(experiment: Experiment[Any], command: Any, about: str, typed: str) 
             chosen, resumed = processes.broadcast(lambda: _directory(experiment, command, typed))
             directory = Path(chosen)
             if not (directory / "config.json").exists():  # in another working directory, or on a disk of its own
-                raise DifferentProcessesError(
-                    f"process {processes.index} does not see {directory.absolute()}, the run of process 0: all must "
-                    "share runs-dir and cache-dir; give the whole path of a shared folder to each"
-                )
+                what = f"process {processes.index} does not see {directory.absolute()}, the run of process 0"
+                raise DifferentProcessesError(f"{what}: all must share runs-dir and cache-dir; give whole paths")
             lock = runs.locked(directory) if processes.writes else contextlib.nullcontext()
             with stopping.listening(), lock, compilations_kept(command.cache_dir / COMPILED):
                 if processes.writes:
