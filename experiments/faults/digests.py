@@ -13,12 +13,10 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from experiments.core.artifacts import read_json
-from touchr1_jax.training.checksums import CHECKSUMS
+from touchr1_jax.training.checksums import old_checkpoints
 
 STATE = "state of "  # begins the name of the digest of a stage's checkpoints
-
-LAST_WRITTEN = ("_CHECKPOINT_METADATA", "commit_success.txt")
-"""Files that Orbax writes into a checkpoint after its checksums."""
+KEPT = 2  # newest checkpoints of a stage, see `Checkpoints`
 
 
 def digests(directory: Path) -> dict[str, str]:
@@ -30,7 +28,8 @@ def digests(directory: Path) -> dict[str, str]:
     found["results"] = _hash(json.dumps([results["verdict"], results["data"]]).encode())
     checkpoints = directory / "checkpoints"
     for stage in sorted({s.parent.parent for s in checkpoints.rglob("state") if s.parent.name.isdigit()}):
-        kept = sorted((p for p in stage.iterdir() if p.name.isdigit() and _whole(p)), key=lambda path: int(path.name))
+        old = old_checkpoints(stage, KEPT, scored=False)  # what a kill left of them does not count
+        kept = sorted({p for p in stage.iterdir() if p.name.isdigit()} - {*old}, key=lambda path: int(path.name))
         found[f"{STATE}{stage.relative_to(checkpoints)}"] = _hash("".join(map(_state_hash, kept)).encode())
     return found
 
@@ -38,12 +37,6 @@ def digests(directory: Path) -> dict[str, str]:
 def differences(a: Mapping[str, str], b: Mapping[str, str]) -> tuple[str, ...]:
     """Names of the digests that differ between two runs."""
     return tuple(sorted(name for name in a.keys() | b.keys() if a.get(name) != b.get(name)))
-
-
-def _whole(checkpoint: Path) -> bool:
-    """False of what a kill during the deletion of an old checkpoint leaves: it lacks a file, whichever went first."""
-    saved = checkpoint / CHECKSUMS
-    return saved.exists() and all((checkpoint / name).exists() for name in (*LAST_WRITTEN, *read_json(saved)))
 
 
 def _state_hash(checkpoint: Path) -> str:

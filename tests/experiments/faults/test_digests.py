@@ -8,16 +8,18 @@ import pytest
 from experiments.core.artifacts import write_json
 from experiments.faults.digests import differences, digests
 from touchr1_jax.training.checkpoint import Checkpoints
+from touchr1_jax.training.checksums import CHECKSUMS
 
 
 @pytest.fixture
 def run(tmp_path):
-    """A finished run with one checkpoint of these numbers."""
+    """A finished run with two checkpoints of these numbers."""
 
     def make(name: str, weight: float = 1.0, drawn: int = 3):
         directory = tmp_path / name
         with Checkpoints(directory / "checkpoints" / "sft" / "0") as checkpoints:
-            checkpoints.save(12, {"w": jnp.array([weight, 2.0]), "step": jnp.array(12)}, drawn)
+            for step in (12, 16):
+                checkpoints.save(step, {"w": jnp.array([weight, 2.0]), "step": jnp.array(step)}, drawn)
         (directory / "metrics.jsonl").write_text("")
         write_json(directory / "results.json", {"verdict": [], "data": {}})
         return directory
@@ -39,7 +41,7 @@ def test_the_file_that_names_the_devices_does_not_count(run):
     assert digests(whole) == digests(damaged)
 
 
-def test_a_half_deleted_old_checkpoint_does_not_count_and_a_missing_one_does(run):
+def test_what_a_kill_left_of_an_old_checkpoint_does_not_count_and_damage_of_another_does(run):
     whole, killed = run("a"), run("b")
     stage = killed / "checkpoints" / "sft" / "0"
     files = [path.relative_to(stage / "12") for path in (stage / "12").rglob("*") if path.is_file()]
@@ -48,5 +50,8 @@ def test_a_half_deleted_old_checkpoint_does_not_count_and_a_missing_one_does(run
         (half / lost).unlink()
         assert digests(whole) == digests(killed), lost
         shutil.rmtree(half)
-    (stage / "12" / "data" / "metadata").unlink()
+    for unread in ("_CHECKPOINT_METADATA", "commit_success.txt", CHECKSUMS):  # a run ends as it had to without these
+        (stage / "12" / unread).unlink()
+        assert digests(whole) == digests(killed), unread
+    shutil.rmtree(stage / "12")
     assert differences(digests(whole), digests(killed)) == ("state of sft/0",)
