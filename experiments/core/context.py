@@ -332,7 +332,7 @@ class Context:
         if not isinstance(content, dict) or content.keys() != {"stage", "result"}:
             return content
         if content["stage"] not in (stage, labelled(self.directory, stage)):
-            other = ValueError(f"it is of stage {content['stage']!r}, or of another run")
+            other = ValueError(f"it is of {content['stage']!r}, this is {labelled(self.directory, stage)!r}")
             raise DamagedFileError(f"{path} is damaged ({other}): put its own copy back, or remove it") from other
         return content["result"]
 

@@ -66,7 +66,7 @@ def require_supported() -> None:
 
 
 def settings() -> dict[str, Any]:
-    """The settings of JAX and the flags of XLA that change results."""
+    """The settings of JAX, flags of XLA and variables of the environment that change results."""
     given = os.environ.get(FLAGS, "").strip()
     if given and not given.startswith("-") and Path(given).is_file():  # XLA then reads its flags from there
         given = Path(given).read_text(encoding="utf-8")
@@ -78,8 +78,9 @@ def settings() -> dict[str, Any]:
 
 
 def environment() -> dict[str, str]:
-    """The variables of `ENVIRONMENT` that differ from their defaults."""
-    return {name: os.environ[name] for name, usual in ENVIRONMENT.items() if os.environ.get(name, usual) != usual}
+    """The variables of `ENVIRONMENT` that differ from their defaults; of the C library's, what chooses its kernels."""
+    found = {name: os.environ[name] for name, usual in ENVIRONMENT.items() if os.environ.get(name, usual) != usual}
+    return {name: value for name, value in found.items() if name != "GLIBC_TUNABLES" or "glibc.cpu." in value}
 
 
 def require_same(before: Mapping[str, Any] | None, where: object) -> None:

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from experiments.core.commands import print_error, print_lines
+from experiments.core.runs import LATEST
 from sensors_io.remote import Mirror, StoreError
 from touchr1_jax.training.checksums import CHECKSUMS
 
@@ -66,7 +67,7 @@ class _Copier:
         for name in files:
             run, _, inside = name.partition("/")
             whole = not inside.startswith("checkpoints/") or name.startswith(signed)
-            if run not in finished and whole:
+            if run not in (*finished, LATEST) and whole:  # an upload may have followed the link
                 (path := self._folder / name).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(self._remote.fetch(name), path)
         self._sent = {name: _state(path) for name, path in self._files().items()}

@@ -198,13 +198,14 @@ def read_description(directory: Path) -> dict[str, Any]:
 
 
 def labelled(directory: Path, name: str) -> str:
-    """Name and configuration that a file of a run states, so that one of another run is not taken for it.
+    """Name, experiment and configuration that a file of a run states, so that one of another run is not taken for it.
 
-    Runs of one configuration make the same files.  A folder without `config.json` is a unit of work, which has its own.
+    A folder without `config.json`, such as a unit of work or a part of a run, is told from others by its own name.
     """
-    described = (directory / "config.json").exists()
-    config = json.dumps(read_description(directory)["config"], sort_keys=True) if described else ""
-    return f"{name} {hashlib.sha256(config.encode()).hexdigest()[:8]}"
+    about: Any = directory.name
+    if (directory / "config.json").exists():
+        about = [read_description(directory)[field] for field in ("experiment", "config")]
+    return f"{name} {hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:8]}"
 
 
 def _describes_run(found: Any) -> bool:

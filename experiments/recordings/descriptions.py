@@ -24,7 +24,7 @@ from sensors_io.schema import LEVELS as SCENE_LEVELS
 from sensors_io.touches import describe, families, read_touch, touch_of_scene
 from touchr1_jax.models.description_policy import LANGUAGE, LEVELS
 
-VERSION = 2  # raised when a description changes, so that no cache outlives it
+OF_VIDEOS, OF_SCENES = 2, 1  # raised when descriptions change, so that no cache outlives it
 SUFFIXES = (".mov", ".mp4", ".avi", ".mkv")  # file names that count as videos in a folder that no table lists
 SceneDescriber = Callable[[SceneConfig], Float[np.ndarray, "n D"]]
 ROWS = ("names", "objects", "label", "x", "rating")  # of `DescribedVideos`, one entry for each video
@@ -136,7 +136,7 @@ def _describe_files(
         return {"x": x, "reasons": np.array(reasons)}
 
     states = [(str(p.resolve()), *_state(p)) for p in files]
-    cached = _cached(context, "descriptions", [VERSION, frames, families(), states], make)
+    cached = _cached(context, "descriptions", [OF_VIDEOS, frames, families(), states], make)
     reasons = cached["reasons"]
     read = np.flatnonzero(reasons == "")
     if not len(read):
@@ -188,7 +188,7 @@ def describe_scenes(config: SceneConfig, context: Context) -> Float[np.ndarray, 
             every = context.each("generating and describing scenes", range(config.contact_count))
             return {"x": np.array([describe(touch_of_scene(press_pictures(config, i))) for i in every])}
 
-    return _cached(context, "scene-descriptions", [VERSION, config_hash(config), families()], make)["x"]
+    return _cached(context, "scene-descriptions", [OF_SCENES, config_hash(config), families()], make)["x"]
 
 
 def scene_properties(config: SceneConfig) -> tuple[Float[np.ndarray, "n T"], np.ndarray]:
@@ -209,5 +209,6 @@ def _cached(
     context: Context, name: str, identity: Sequence[object], make: Callable[[], dict[str, np.ndarray]]
 ) -> dict[str, np.ndarray]:
     """Arrays from a file of the cache that is named by the hash of an identity and of NumPy's and OpenCV's settings."""
-    digest = hashlib.sha256(json.dumps([*identity, numerics.environment()]).encode()).hexdigest()[:16]
+    settings = [found] if (found := numerics.environment()) else []  # files of earlier versions keep their names
+    digest = hashlib.sha256(json.dumps([*identity, *settings]).encode()).hexdigest()[:16]
     return context.cached_arrays(f"{name}-{digest}", make, compressed=True)

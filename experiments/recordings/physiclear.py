@@ -142,14 +142,16 @@ def policy_of(config: PhysiclearStudy, data_dir: Path, context: Context) -> Trai
     """The policy of the cache if it was trained on these videos and scenes, else one that is trained now."""
     every = describe_source(data_dir, config.frames, context, config.objects)
     videos, auxiliary = every.labelled(), auxiliary_data(config.scenes, config.scene_sets, every, context)
-    path = cached_policy(config, context)
-    if path.exists():
-        kept = load(path, config.learn)
-        pairs = [(getattr(kept.training, name), getattr(videos, name)) for name in ("objects", "label", "x")]
-        pairs += [(getattr(kept.auxiliary, name), value) for name, value in vars(auxiliary).items()]
-        if all(np.array_equal(a, b) for a, b in pairs):
-            return kept
-        context.print(f"{path} was trained on other videos or scenes, and is made again")
+    for path in (context.directory / POLICY, cached_policy(config, context)):
+        if path.exists():
+            kept = load(path, config.learn)
+            pairs = [(getattr(kept.training, name), getattr(videos, name)) for name in ("objects", "label", "x")]
+            pairs += [(getattr(kept.auxiliary, name), value) for name, value in vars(auxiliary).items()]
+            pairs.append((np.nan_to_num(kept.training.rating, nan=-1), np.nan_to_num(videos.rating, nan=-1)))
+            if all(np.array_equal(a, b) for a, b in pairs):
+                return kept
+            context.print(f"{path} was trained on other videos or scenes: another policy is trained")
+    (context.directory / POLICY).unlink(missing_ok=True)  # of a session before the videos changed
     train_policy(config, videos, auxiliary, context)
     return load(context.directory / POLICY, config.learn)
 

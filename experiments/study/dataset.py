@@ -133,7 +133,7 @@ def split_parts(store: RecordStore, grpo_share: float | None, left_out: Sequence
             raise DataError(
                 f"part {name!r} of the data set holds no contact: every part needs one; use more objects, another "
                 f"grpo_share (now {grpo_share}), or splits with objects in train, val and test"
-                + (f"; {len(left_out)} odd ones are left out" if len(left_out) else "")
+                + (f"; drop_odd leaves out {len(left_out)} contacts" if len(left_out) else "")
             )
     return parts
 

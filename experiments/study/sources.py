@@ -95,14 +95,16 @@ def odd_contacts(config: SourceConfig, path: Path, context: Context) -> tuple[in
     if config.data == "generated":
         return ()
     store, reasons = RecordStore(path), dict[str, dict[int, str]]()
-    first, films = dict[str, int](), dict[str, Counter[str]]()
+    alike, films = dict[str, list[int]](), dict[str, Counter[str]]()
     for i in context.each("looking for odd contacts", range(len(store))):
         contact = store.contact(i)
         for sensor, sequence in contact.items():
             films.setdefault(sensor, Counter())[_film(sequence)] += 1
             for reason in oddities(sequence):
                 reasons.setdefault(reason, {})[i] = sequence.name
-        twins = {n: store.contacts[n].object_id for n in (first.setdefault(recorded_digest(contact), i), i)}
+        alike.setdefault(recorded_digest(contact), []).append(i)
+    for rows in alike.values():
+        twins = {n: store.contacts[n].object_id for n in rows}
         if len(set(twins.values())) > 1:
             reasons.setdefault("the same recording as of another object", {}).update(twins)
     for sensor, kinds in films.items():

@@ -158,7 +158,7 @@ class Checkpoints:
         state = jax.tree.map(jnp.copy, state)
         if score is not None and self._is_best(score):
             self._best = step, score
-        held = {"data": data, "digests": _digests(state), "of": self._label(step)}
+        held = {"data": data, "digests": _digests(state)} | ({"of": self._label(step)} if self._of else {})
         held |= {"best": self._best} if self._better else {}
         args = ocp.args.Composite(
             state=ocp.args.StandardSave(state), data=ocp.args.JsonSave(held | {"crc32": _crc32(held)})
@@ -286,7 +286,7 @@ class Checkpoints:
         return Restored(step, found.state, data, None if best is None else (best[0], best[1]))
 
     def _label(self, step: int) -> str:
-        return f"{self._of} step {step}".strip()
+        return f"{self._of} step {step}"
 
     def _ranked(self) -> tuple[int, float] | None:
         """The best by Orbax's scores, for checkpoints of earlier versions, which do not name it."""

@@ -54,6 +54,8 @@ def test_flags_in_a_file_and_variables_of_accelerators_are_settings(monkeypatch,
         with monkeypatch.context() as one:
             one.setenv(name, value)
             assert numerics.settings() == {**before, name: value}
+    monkeypatch.setenv("GLIBC_TUNABLES", "glibc.malloc.arena_max=1")
+    assert numerics.settings() == before
 
 
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="one core gives one thread")

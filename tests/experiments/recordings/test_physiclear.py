@@ -93,6 +93,11 @@ def test_a_kept_policy_answers_for_a_folder(run):
         assert run_small("--predict", str(unseen), "--out", str(out), *order, *places) == 0
         results = read_json(home / "runs" / "physiclear" / "latest" / "results.json")
         assert results["settings"]["objects learned from"] == number
+    (home / "runs" / "physiclear" / "latest" / "results.json").unlink()  # the same run goes on
+    (other / "labels.json").write_text(json.dumps(table | {"objects": table["objects"][:4]}))
+    assert run_small("--predict", str(unseen), "--out", str(out), *order[:-1], *places) == 0
+    results = read_json(home / "runs" / "physiclear" / "latest" / "results.json")
+    assert results["settings"]["objects learned from"] == 4
 
 
 @pytest.mark.parametrize("name", ["physiclear", "sim_to_real"])

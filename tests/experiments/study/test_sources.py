@@ -117,7 +117,7 @@ def test_imported_videos_are_named_by_folder_and_settings(tmp_path, context, mon
 
 
 def test_odd_contacts_of_recordings_are_listed_before_training_and_left_out_on_request(data, tmp_path, context):
-    """Of training contacts one is black for one sensor, one a copy of the first; one object was never touched."""
+    """Of training contacts one is black for one sensor, two copies of the first, one of them of its own object."""
     store = data.store
     first, black, *_, copy = train = store.contacts_of_split("train").tolist()
     with RecordWriter(tmp_path / "odd", meta=store.meta) as writer:
@@ -131,16 +131,19 @@ def test_odd_contacts_of_recordings_are_listed_before_training_and_left_out_on_r
             if i == copy:
                 sequences = [dataclasses.replace(x, key=store.contacts[i]) for x in store.contact(first).values()]
             writer.write_contact(sequences)
+        again = dataclasses.replace(store.contacts[first], trial=9)
+        writer.write_contact([dataclasses.replace(x, key=again) for x in store.contact(first).values()])
+    count = len(store) + 1
     config = StageOneDataConfig(data="records", data_dir=tmp_path / "odd")
-    assert odd_contacts(config, tmp_path / "odd", context) == tuple(sorted((first, black, copy)))
+    assert odd_contacts(config, tmp_path / "odd", context) == tuple(sorted((first, black, copy, count - 1)))
     parts = open_touch(dataclasses.replace(config, drop_odd=True), 2, 16, context).parts
     assert set(np.concatenate(list(parts.values()))) == set(range(len(store))) - {first, black, copy}
     printed = context.console.file.getvalue()
-    assert f"all pictures black: 1 of {len(store)} contacts are trained on (option drop-odd leaves them out)" in printed
-    twins = ", ".join(store.contacts[i].object_id for i in (first, copy))
-    assert f"the same recording as of another object: 2 of {len(store)} contacts are left out: {twins}\n" in printed
+    assert f"all pictures black: 1 of {count} contacts are trained on (option drop-odd leaves them out)" in printed
+    twins = ", ".join(store.contacts[i].object_id for i in (first, copy, first))
+    assert f"the same recording as of another object: 3 of {count} contacts are left out: {twins}\n" in printed
     assert f"without any contact: 1 of {len(store.objects) + 1} objects, such as untouched" in printed
-    assert f"gelsight_mini: {len(store)} of 28 × 28 at " in printed
+    assert f"gelsight_mini: {count} of 28 × 28 at " in printed
     (hardness,) = (line for line in printed.splitlines() if line.startswith("hardness, objects of levels 0 to 2: "))
     for part, rows in (("training", train[2:-1]), ("test", store.contacts_of_split("test"))):
         levels = [store.objects[store.contacts[i].object_id].labels["hardness"] for i in rows]

@@ -100,11 +100,14 @@ def test_answers_survive_the_disk(tmp_path, alone):
     assert [p.name for p in path.parent.iterdir()] == ["sft-0.npz"]
 
 
-@pytest.mark.parametrize("name", ["run/answers/sft-1.npz", "run/answers/paper-0.npz", "other/answers/sft-0.npz"])
+@pytest.mark.parametrize(
+    "name", ["run/answers/sft-1.npz", "run/answers/paper-0.npz", "other/answers/sft-0.npz", "twin/answers/sft-0.npz"]
+)
 def test_answers_of_another_policy_seed_or_run_are_not_taken(tmp_path, name):
     git = {"commit": "", "dirty": False}
-    for run, steps in (("run", 9), ("other", 8)):
-        write_json(tmp_path / run / "config.json", dict.fromkeys(FIELDS, "") | {"config": {"steps": steps}, "git": git})
+    for run, experiment, steps in (("run", "a", 9), ("other", "a", 8), ("twin", "b", 9)):
+        told = {"experiment": experiment, "config": {"steps": steps}, "git": git}
+        write_json(tmp_path / run / "config.json", dict.fromkeys(FIELDS, "") | told)
     mine = tmp_path / "run" / "answers" / "sft-0.npz"
     save_answers(mine, answers_about(TEST))
     (tmp_path / name).parent.mkdir(exist_ok=True)

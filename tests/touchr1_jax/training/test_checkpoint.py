@@ -153,6 +153,10 @@ class TestDamage:
         assert f"is of {source} step 2: must be of mine step 3" in told[0]
         with Checkpoints(tmp_path / "mine") as checkpoints:
             assert checkpoints.restore(self.numbers(0)).step == left
+        with Checkpoints(tmp_path / "unnamed") as checkpoints:
+            checkpoints.save(1, self.numbers(1), None)
+        with Checkpoints(tmp_path / "unnamed", of="mine") as checkpoints:
+            assert checkpoints.restore(self.numbers(0)).step == 1
 
     def test_a_flipped_bit_of_any_file_does_not_pass(self, stage):
         """Of a few places of each, its checksums among them, before Orbax reads anything."""
