@@ -72,7 +72,9 @@ def distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
         twice = collections.Counter(name for name, _ in pairs).most_common(1)[0][0]
-        raise ValueError(f"{twice!r} stands there twice in one object: keep one of them")
+        raise ValueError(
+            f"{twice!r} stands there twice in one object: keep one of them, or copy the file again if nobody edited it"
+        )
     return found
 
 

@@ -156,7 +156,7 @@ def oddities(sequence: Sequence, config: QualityConfig | None = None) -> tuple[s
         "every frame flagged": bool(sequence.flags.all()),
     }
     if sequence.frames is not None:
-        small, even = sequence.frames.shape[1:3] == (1, 1), bool((sequence.frames == sequence.frames[:, :1, :1]).all())
+        small, even = sequence.frames.shape[1:3] == (1, 1), all((f == f[:1, :1]).all() for f in sequence.frames)
         colour = {(0,): "black", (255,): "white"}.get(tuple(np.unique(sequence.frames[:, 0, 0])), "of one colour")
         found["pictures of one pixel"] = small
         found[f"all pictures {colour}"] = even and not small
@@ -169,11 +169,11 @@ def oddities(sequence: Sequence, config: QualityConfig | None = None) -> tuple[s
 
 
 def _stands_still(rows: np.ndarray) -> bool:
-    return len(rows) > 1 and bool((rows == rows[:1]).all())
+    return len(rows) > 1 and all((row == rows[0]).all() for row in rows[1:])
 
 
 def recorded_digest(recorded: Mapping[str, Sequence]) -> str:
-    """Sixteen digits of the hash of a contact's arrays by sensor but the clock: a copy under another name has them."""
+    """First 16 digits of a hash of a contact's arrays without times: a copy under another name has the same."""
     digest = hashlib.sha256()
     for sensor, sequence in sorted(recorded.items()):
         digest.update(sensor.encode())

@@ -48,8 +48,8 @@ class ClockMap:
           host_ns: when it arrived; must not decrease from call to call.
           late: by its number it was taken before the last one, so that its stamp may go back.
         """
-        if late and self._rising and not self.slow:
-            return min(device_ns + self._rising[0][1], host_ns)
+        if late and self._rising:
+            return host_ns if self.slow else min(device_ns + self._rising[0][1], host_ns)
         if self._last_device_ns is not None and device_ns < self._last_device_ns:
             self._rising.clear()
             self._second, self.slow = None, False
@@ -172,7 +172,8 @@ class PeriodGaps:
         e = t − φ − k T,   φ ← φ + k T + e / 8,   T ← T + e / (256 k)
 
     so that a sample that is more than half a period late counts one as missing, and the next, on time, takes it back.
-    A device that sends faster than it is said to sends samples that take back none, and soon a second of them.
+    Samples that come early while none is counted as missing are extra: more than a second of them say that the device
+    sends faster than its period.
 
     Args:
       period_ns: time between two samples, to 5 %.
@@ -187,7 +188,7 @@ class PeriodGaps:
             raise ValueError(f"period_ns is {period_ns}: must be > 0; give 10⁹ over the frame rate")
         self._nominal_ns = self._period_ns = float(period_ns)
         self._phase_ns: float | None = None
-        self._counted = 0  # as missing, less those taken back
+        self._counted = 0  # as missing, less those taken back; of the last second, for no sample is held up for longer
         self._early = self._extra = 0  # samples that came early and took back none: since the last on time, and ever
 
     @property
@@ -207,8 +208,7 @@ class PeriodGaps:
             return _NEXT
         count = round((time_ns - self._phase_ns) / self._period_ns)
         error = time_ns - self._phase_ns - count * self._period_ns
-        if count >= 0:  # the times of the host do not run back: a stamp that does is wrong
-            self._phase_ns += count * self._period_ns + self._PHASE_GAIN * error
+        self._phase_ns += count * self._period_ns + self._PHASE_GAIN * error
         if count == 1:
             period = self._period_ns + self._PERIOD_GAIN * error
             self._period_ns = min(
@@ -224,5 +224,5 @@ class PeriodGaps:
             missing = count - 1 + came_early
         self._early += came_early
         self._extra += came_early
-        self._counted += missing
+        self._counted = min(self._counted + missing, max(1, round(NS_PER_S / self._nominal_ns)))
         return CounterStep(missing=missing)

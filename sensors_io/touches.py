@@ -98,8 +98,10 @@ def find_touch(frames: np.ndarray, count: int) -> VideoTouch:
     """
     if len(frames) < 3:
         raise VideoError(f"holds {len(frames)} frames: a touch needs three, at rest, in contact and between; record it")
-    if (frames == frames[:1]).all():
-        raise VideoError(f"shows one picture in all of its {len(frames)} frames: a touch changes them; record it")
+    if all((frame == frames[0]).all() for frame in frames[1:]):
+        raise VideoError(
+            f"shows one picture in all of its {len(frames)} frames: a touch changes them; record the touch"
+        )
     small = np.stack([_resize(frame, PROBE_PX) for frame in frames]).astype(np.float32)
     since_start = np.abs(small - small[0]).mean((1, 2, 3))
     quiet = np.flatnonzero(since_start <= max(REST_COUNTS, float(np.quantile(since_start, 0.1))))[:REST_FRAMES]

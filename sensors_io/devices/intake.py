@@ -30,6 +30,7 @@ from sensors_io.devices.errors import (
 from sensors_io.sync import ClockMap, CounterStep, IndexGaps, PeriodGaps
 
 _REPEATED_NS = NS_PER_S // 4  # for which all numbers were seen before: the counter began anew
+_HELD_NS = 2 * NS_PER_S  # by a link; who is away for longer may have begun anew, though number and stamp go on
 _CLOCK_SET_NS = 10 * NS_PER_S  # between two clocks since the last sample: no buffer holds one back for so long
 
 
@@ -100,7 +101,7 @@ class Intake:
         self._period_ns: int | None = None
         self._stamps: tuple[int, int] | None = None  # of the last sample, on the device's clock and on the host's
         self._repeated_ns: int | None = None  # arrival of the first repeated number since the last new one
-        self._away = self._told_fast = self._overtaken = False
+        self._away = self._told_fast = self._overtaken = self._back = False
         self._broken_since = 0  # the last whole sample
         self._warned_at = 0
 
@@ -288,8 +289,8 @@ class Intake:
         if sample.index is None and self._period_gaps.fast and not self._told_fast:
             self._told_fast = True
             warnings.warn(
-                f"{self._device} sends faster than the rate that it is said to have, by which its losses are counted: "
-                "they are counted too low; state its rate, as with --rate-hz",
+                f"{self._device} sends faster than the {NS_PER_S / (self._period_ns or 1):.3g} Hz that it states, by "
+                "which its losses are counted: they are counted too low; state the rate at which it sends (--rate-hz)",
                 WrongRateWarning,
                 stacklevel=3,
             )
@@ -304,8 +305,10 @@ class Intake:
         last, self._stamps = self._stamps, (stamp, host)
         if last is not None:
             moved = (stamp - last[0]) - (host - last[1])
-            if anew or stamp < last[0] or abs(moved) > _CLOCK_SET_NS:
+            back = stamp < last[0]
+            if anew or back or self._back or abs(moved) > _CLOCK_SET_NS:  # after one wrong stamp comes a right one
                 gaps.shift(moved)
+            self._back = back
         return gaps.step(stamp)
 
     def _goes_on(self, sample: Sample) -> bool:
@@ -315,9 +318,10 @@ class Intake:
             return False
         if sample.device_time_ns is None or last.device_time_ns is None:
             return False
-        steps = sample.index - last.index
-        apart_ns = sample.device_time_ns - last.device_time_ns - steps * self._period_ns
-        return abs(apart_ns) <= self._period_ns * (1 + abs(steps) / 20)
+        steps, since_ns = sample.index - last.index, sample.device_time_ns - last.device_time_ns
+        if sample.host_time_ns - last.host_time_ns - since_ns > _HELD_NS:
+            return False
+        return abs(since_ns - steps * self._period_ns) <= self._period_ns * (1 + abs(steps) / 20)
 
     def _same_picture(self, sample: Sample) -> bool:
         """True if a picture without a counter repeats the last one: sensor noise never repeats itself."""

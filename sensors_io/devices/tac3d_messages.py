@@ -296,7 +296,7 @@ def load_recording(path: pathlib.Path) -> Tac3dArrays:
 
 
 def _require_numbers(path: pathlib.Path, name: str, array: np.ndarray) -> None:
-    """Refuse times, counts or fields that are no numbers, times or counts beyond 64 bits, and parts of a count."""
+    """Refuse times, counts or fields that are no numbers, times or counts beyond 64 bits, counts that are not whole."""
     count = name == "index"
     top = _LATEST_S if name.endswith("Timestamp") else 2.0**63 if count else None
     numbers = array.ndim > 0 and array.dtype.kind in "fiu" and not (count and np.any(array != np.trunc(array)))

@@ -175,6 +175,8 @@ class _Shared:
                 "recording": self._recording(stream, key, force.residual_n)
                 | {
                     "left_out": given - len(frames),
+                    "without_force": sum(e.kind == "frame" and e.plain["stream"] == number for e in self.entries)
+                    - given,
                     "broken": {name: int(rows.sum()) for name, rows in broken.items()},
                     "silent_s": silent_s,
                 },

@@ -2,7 +2,6 @@
 
 import collections
 import contextlib
-import dataclasses
 import socket
 import struct
 import time
@@ -128,9 +127,14 @@ def test_an_old_number_after_a_silence_is_a_duplicate():
     assert (intake.counts.restarts, intake.counts.duplicates, intake.counts.missing) == (0, 1, 1)
 
 
-def test_a_clock_that_stands_still_is_named_once():
+@pytest.mark.parametrize("rate", [0, 0.5])
+def test_a_slow_clock_is_named_once(rate):
+    """Also where one message overtakes another."""
     intake = Intake(capacity=99, clock=JumpingClock())
-    samples = [dataclasses.replace(sample(k, time_ms=33 * k), device_time_ns=0) for k in range(90)]
+    intake.opened(Identity(sensor="tac3d", period_s=0.033))
+    numbers = [*range(100), 101, 100, *range(102, 200)]
+    stamped = [(n, round(33 * n * rate * 1e6)) for n in numbers]
+    samples = [sample(n, time_ms=33 * k, device_time_ns=ns) for k, (n, ns) in enumerate(stamped)]
     with pytest.warns(WrongRateWarning, match="fall behind") as told:
         [intake.offer(one) for one in samples]
     assert len(told) == 1
@@ -142,9 +146,12 @@ def test_a_device_that_sends_faster_than_it_is_said_to_loses_no_less_than_nothin
     intake = Intake(capacity=999, clock=JumpingClock())
     intake.opened(Identity(sensor="digit", period_s=1 / 32))
     times = [1000 * k // hz for k in range(10 * hz)]
-    with pytest.warns(WrongRateWarning, match="digit sends faster than the rate") as told:
+    with pytest.warns(WrongRateWarning, match="digit sends faster than the 32 Hz that it states") as told:
         collections.deque((intake.offer(sample(time_ms=ms)) for ms in times), maxlen=0)
     assert (len(told), intake.counts.missing) == (1, 0)
+    for ms in times:
+        intake.offer(sample(time_ms=40_000 + ms))  # after half a minute
+    assert 29 * 32 <= intake.counts.missing <= 31 * 32
 
 
 def test_a_layout_of_spaces_is_read_in_linear_time():

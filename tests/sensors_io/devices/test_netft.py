@@ -72,7 +72,7 @@ def test_numbers_of_a_sensor_that_was_opened_again_have_times_of_their_own():
         stamps.append(device.read(5.0).device_time_ns)
     with sensor([record(6, *[0] * 6)]) as (device._config, _), device:
         stamps.append(device.read(5.0).device_time_ns)
-    assert stamps[1] - stamps[0] > 2_000_000
+    assert stamps[1] - stamps[0] > 1_000_000  # that of the numbers alone
 
 
 def test_buffered_records_are_spread_over_their_periods():

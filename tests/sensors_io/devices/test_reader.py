@@ -149,17 +149,28 @@ def test_a_counter_that_restarts_on_reconnecting_leaves_the_loss_to_the_clock(st
 
 
 @pytest.mark.parametrize(
-    ("numbers", "arrival_ms", "lost_at"),
-    [([4, 5, 7, 6, 8], [40, 50, 70, 78, 80], None), ([4, 5, 6, 7, 8], [40, 50, 900, 901, 902], 2)],
-    ids=["overtaken", "held up for longer than a device may be silent"],
+    ("numbers", "arrival_ms", "lost_at", "times_ms"),
+    [
+        ([4, 5, 7, 6, 8], [40, 50, 70, 78, 80], None, [40, 50, 70, 60, 80]),
+        ([4, 5, 6, 7, 8], [40, 50, 900, 901, 902], 2, [40, 50, 60, 70, 80]),
+        ([4, 5, 6, 7, 8], [40, 50, 5060, 5070, 5080], 2, [40, 50, 5060, 5070, 5080]),
+    ],
+    ids=["overtaken", "held up for longer than a device may be silent", "started again"],
 )
-def test_late_samples_whose_stamps_go_with_their_numbers_have_their_own_times(numbers, arrival_ms, lost_at):
+def test_late_samples_whose_stamps_go_with_their_numbers_have_their_own_times(numbers, arrival_ms, lost_at, times_ms):
     stamped = zip(numbers, arrival_ms, strict=True)
     script = [sample(index, time_ms, device_time_ns=10 * index * MS) for index, time_ms in stamped]
     if lost_at is not None:
         script.insert(lost_at, DeviceLostError("x"))
     got = drain(pumped(Scripted(script, period_s=0.01)))
-    assert [s.host_time_ns // MS for s in got] == [10 * n for n in numbers]
+    assert [s.host_time_ns // MS for s in got] == times_ms
+
+
+@pytest.mark.parametrize("wrong_ms", [-300, -9000])
+def test_one_stamp_that_goes_back_is_no_loss(wrong_ms):
+    stamp_ms = [10_000 + 10 * k + (wrong_ms if k == 5 else 0) for k in range(9)]
+    script = [sample(None, 10 * k, device_time_ns=ms * MS) for k, ms in enumerate(stamp_ms)]
+    assert pumped(Scripted(script, period_s=0.01)).counts.missing == 0
 
 
 @pytest.mark.parametrize("set_by_s", [-3600, 3600])
