@@ -30,7 +30,7 @@ from sensors_io.devices.errors import (
 from sensors_io.sync import ClockMap, CounterStep, IndexGaps, PeriodGaps
 
 _REPEATED_NS = NS_PER_S // 4  # for which all numbers were seen before: the counter began anew
-_HELD_NS = 2 * NS_PER_S  # by a link; who is away for longer may have begun anew, though number and stamp go on
+_HELD_NS = 3 * NS_PER_S  # by a link; who is away for longer may have begun anew, though number and stamp go on
 _CLOCK_SET_NS = 10 * NS_PER_S  # between two clocks since the last sample: no buffer holds one back for so long
 
 

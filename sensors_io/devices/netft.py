@@ -59,6 +59,8 @@ _TORQUE_UNIT_NMM: Mapping[int, float] = {
     1: 112.9848290276, 2: 1355.8179483314, 3: 1000.0, 4: 1.0, 5: 98.0665, 6: 1e6
 }  # fmt: skip
 
+_NUMBERS = 2**32  # of records, after which they begin at 0
+
 
 class Command(enum.IntEnum):
     """Commands of the sensor."""
@@ -194,6 +196,7 @@ class NetFt:
         self._records: deque[tuple[int, bool, bytes]] = deque()
         self._rate = _RateCheck(config.rate_hz)
         self._first_opened_ns: int | None = None
+        self._number: int | None = None  # of the last record, which goes on where the sensor's runs around
         self._began_ns = 0  # of its numbers, which may begin anew whenever it is opened; since it was first opened
 
     @property
@@ -203,12 +206,12 @@ class NetFt:
         where = f"udp://{c.host}:{c.rdt_port}"
         return Identity(
             sensor="netft", product="ATI Net F/T", where=where, settings=counts, period_s=1 / c.rate_hz,
-            counter_modulus=2**32,
+            counter_modulus=_NUMBERS,
         )  # fmt: skip
 
     def __enter__(self) -> Self:
         c = self._config
-        self._rate = _RateCheck(c.rate_hz)
+        self._rate, self._number = _RateCheck(c.rate_hz), None
         now_ns = time.monotonic_ns()
         self._first_opened_ns = now_ns if self._first_opened_ns is None else self._first_opened_ns
         self._began_ns = now_ns - self._first_opened_ns
@@ -243,11 +246,13 @@ class NetFt:
             raise DeviceDataError(f"NetFT record {number} has status {status:#010x}: {_meaning(status)}")
         assert self._calibration is not None
         values = np.array(counts, np.float64)
-        period_ns = NS_PER_S / self._config.rate_hz
+        period_ns, last = NS_PER_S / self._config.rate_hz, number if self._number is None else self._number
+        self._number = last + (number - last + _NUMBERS // 2) % _NUMBERS - _NUMBERS // 2
         self._check_rate(number, stamp_ns, waited)
+        timed = self._rate.measured_hz is None
         return Sample(
             host_time_ns=stamp_ns,
-            device_time_ns=None if self._rate.measured_hz is not None else self._began_ns + round(number * period_ns),
+            device_time_ns=self._began_ns + round(self._number * period_ns) if timed else None,
             index=number,
             arrays={
                 "force_n": (values[:3] / self._calibration.counts_per_n).astype(np.float32),

@@ -49,7 +49,7 @@ def sensor(datagrams, calibration=NEWTONS):
 
 
 def record(number, *counts, status=0):
-    return RECORD.pack(number, 10 * number, status, *counts)
+    return RECORD.pack(number, 10 * number % 2**32, status, *counts)
 
 
 def test_counts_become_newtons_and_newton_millimetres():
@@ -73,6 +73,13 @@ def test_numbers_of_a_sensor_that_was_opened_again_have_times_of_their_own():
     with sensor([record(6, *[0] * 6)]) as (device._config, _), device:
         stamps.append(device.read(5.0).device_time_ns)
     assert stamps[1] - stamps[0] > 1_000_000  # that of the numbers alone
+
+
+def test_a_number_that_runs_around_does_not_set_the_clock_back():
+    numbers = [2**32 - 2, 2**32 - 1, 0, 1]
+    with sensor([b"".join(record(n, *[0] * 6) for n in numbers)]) as (config, _), config.open() as device:
+        stamps = [device.read(5.0).device_time_ns for _ in numbers]
+    assert np.diff(stamps).tolist() == [1_000_000] * 3
 
 
 def test_buffered_records_are_spread_over_their_periods():
