@@ -286,14 +286,15 @@ class _Force:
 def _gaps(time_ns: np.ndarray, index: Seq[int | None], period_s: float | None) -> np.ndarray:
     """Frames at which the counter does not go on by one, or, without one, that come too late for the period.
 
-    Where that is unknown, too late is three times the usual step, as times may be uneven.
+    Where that is unknown, too late is three times the usual step, as times may be uneven; with a counter, it is so
+    after a second of silence too, for one that begins anew may be just at the next number.
     """
-    counter = [i for i in index if i is not None]
+    counter, steps = [i for i in index if i is not None], np.diff(time_ns, prepend=time_ns[0])
+    later = steps[1:] if len(steps) > 1 else steps
     if len(counter) == len(index):
-        return np.diff(np.array(counter, np.int64), prepend=counter[0] - 1) != 1
-    steps = np.diff(time_ns, prepend=time_ns[0])
+        silent = steps > max(_SILENT_S * NS_PER_S, _GAP_STEPS * np.median(later))
+        return silent | (np.diff(np.array(counter, np.int64), prepend=counter[0] - 1) != 1)
     if period_s is None:
-        later = steps[1:] if len(steps) > 1 else steps
         return steps > _GAP_STEPS * max(np.median(later), np.mean(later))  # the median of bursts is too short
     return steps > _GAP_PERIODS * period_s * NS_PER_S
 

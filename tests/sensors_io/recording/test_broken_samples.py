@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sensors_io.devices.base import Identity, Sample
-from sensors_io.recording.assemble import assemble
+from sensors_io.recording.assemble import _gaps, assemble
 from sensors_io.recording.journal import JournalError, JournalWriter
 from sensors_io.recording.session import record_session
 from sensors_io.records import CorruptRecordsError, RecordStore
@@ -160,6 +160,13 @@ def test_a_sensor_that_is_silent_at_either_end_of_a_contact_is_flagged_and_count
     assert [s > 1 for s in made.camera["recording"]["silent_s"]] == silent
     gaps = np.flatnonzero(made.flags & np.uint32(Flag.TIME_GAP))
     assert gaps.tolist() == [range(len(made))[n] for n in marked]
+
+
+@pytest.mark.parametrize("period_s", [0.033, None])
+def test_a_counter_that_begins_anew_at_the_next_number_hides_no_silence(period_s):
+    time_ns = np.array([0, 33, 66, 3100, 3133]) * MS
+    assert _gaps(time_ns, [7, 8, 9, 10, 11], period_s).tolist() == [False, False, False, True, False]
+    assert not _gaps(np.arange(5) * 2000 * MS, [7, 8, 9, 10, 11], period_s).any()  # of a slow sensor
 
 
 @pytest.mark.parametrize("late_ms", [lambda n: 7 * n % 10, lambda n: -n % 3 * 9])
