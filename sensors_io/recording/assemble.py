@@ -292,7 +292,8 @@ def _gaps(time_ns: np.ndarray, index: Seq[int | None], period_s: float | None) -
     counter, steps = [i for i in index if i is not None], np.diff(time_ns, prepend=time_ns[0])
     later = steps[1:] if len(steps) > 1 else steps
     if len(counter) == len(index):
-        silent = steps > max(_SILENT_S * NS_PER_S, _GAP_STEPS * np.median(later))
+        latest = np.maximum.accumulate(time_ns)  # behind one wrong stamp there is no silence
+        silent = np.diff(latest, prepend=latest[0]) > max(_SILENT_S * NS_PER_S, _GAP_STEPS * np.median(later))
         return silent | (np.diff(np.array(counter, np.int64), prepend=counter[0] - 1) != 1)
     if period_s is None:
         return steps > _GAP_STEPS * max(np.median(later), np.mean(later))  # the median of bursts is too short
