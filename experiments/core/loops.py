@@ -17,6 +17,8 @@ STEPPING, WAITING = "in steps", "waiting for data"
 
 ALARM = "alarm_"  # prefix of the logged metrics that hold alarms, followed by their code
 
+KEPT = 2  # newest checkpoints of a stage
+
 COMPILING = "compiling the first step"  # note beside the bar of a stage until its first step is done
 
 MakeLog = Callable[[Context, str, int], Log]
@@ -53,7 +55,11 @@ def stage_hooks(
     folder = context.checkpoint_dir(stage)
     with (
         Checkpoints(
-            folder, better="higher" if scored else None, print_=context.print, of=labelled(context.directory, stage)
+            folder,
+            KEPT,
+            better="higher" if scored else None,
+            print_=context.print,
+            of=labelled(context.directory, stage),
         ) as checkpoints,
         context.timed(stage),
         context.stopping.patient(context.processes.any) as stopping,
