@@ -27,6 +27,7 @@ from experiments.study.estimates import compare_over_objects, compare_over_seeds
 from experiments.study.training import preset_name
 from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.bench.statistics import Interval
+from touchr1_jax.text.language import EXPLORED_ATTRIBUTES
 from touchr1_jax.training.exploration import NO_CHOICE
 
 METRIC = "acc"  # mean of the accuracy over the five properties
@@ -114,9 +115,9 @@ def compared(
     return tuple(found)
 
 
-def named(comparisons: Sequence[Comparison], a: str, b: str, over: str = "objects") -> Comparison:
-    """The comparison of two arms."""
-    return next(c for c in comparisons if (c.arm, c.against, c.over) == (a, b, over))
+def named(comparisons: Sequence[Comparison], a: str, b: str) -> Comparison:
+    """The comparison of two arms over objects."""
+    return next(c for c in comparisons if (c.arm, c.against, c.over) == (a, b, "objects"))
 
 
 def requirements(
@@ -343,7 +344,8 @@ def trajectories(world: TouchWorld, played: Played, most: int = 7) -> dict[str, 
         for k, choice in enumerate(played.choices[i, question]):
             if choice == NO_CHOICE or len(rows) >= most:
                 break
-            label = report.level_word(question, int(np.asarray(world.bank.label)[objects[i], question]))
+            level = int(np.asarray(world.bank.label)[objects[i], question])
+            label = EXPLORED_ATTRIBUTES[question].levels[level][0]
             outcome = "right" if played.right[i, question] else "wrong"
             words = choices[choice].words.replace(" ", "\n", 1)
             title = f"{PROPERTIES[question]}?\n{words}\n{label}: {outcome}\nobject {i}, touch {k + 1}"

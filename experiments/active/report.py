@@ -13,7 +13,6 @@ from experiments.core.pictures import Heatmap, heatmaps, image_grid
 from experiments.core.results import Cell, Picture, Table, named_table
 from experiments.study.estimates import RESAMPLES
 from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
-from touchr1_jax.text.language import EXPLORED_ATTRIBUTES
 from touchr1_jax.training.exploration import NO_CHOICE
 
 PROCEDURES: Mapping[str, str] = {
@@ -200,8 +199,3 @@ def trajectory_picture(rows: Mapping[str, np.ndarray]) -> Picture:
         content=image_grid({name: list(frames) for name, frames in rows.items()}, cell_inch=1.1),
         kind="png",
     )
-
-
-def level_word(question: int, level: int) -> str:
-    """The word of a level."""
-    return EXPLORED_ATTRIBUTES[question].levels[level][0]

@@ -111,13 +111,8 @@ class VideoWorld:
     fold: Int[np.ndarray, "n"]
 
 
-def read_videos(config: StoppingConfig, source: Path, context: Context) -> VideoWorld:
-    """The labelled objects of PhysiCLeAR's layout that have enough videos."""
-    return world_of(config, describe_source(source, config.frames, context).labelled())
-
-
 def world_of(config: StoppingConfig, videos: DescribedVideos) -> VideoWorld:
-    """Videos by object, in an order drawn by the seed."""
+    """The objects that have enough videos, and those of each in an order drawn by the seed."""
     names, count = np.unique(videos.objects, return_counts=True)
     names = names[count >= config.videos]
     rng = np.random.default_rng(config.seed)
@@ -148,7 +143,7 @@ def bank_of(world: VideoWorld, tested: Int[np.ndarray, "n"], seed: int) -> Touch
 
 def stopping(config: StoppingConfig, source: Path, context: Context) -> tuple[Table, Picture]:
     """Accuracy against the number of videos: policies, a random number, so many for all, thresholds on belief."""
-    world = read_videos(config, source, context)
+    world = world_of(config, describe_source(source, config.frames, context).labelled())
     folds: list[Mapping[str, Played]] = []
     for k in context.each("folds of videos", range(config.folds)):
         compute = functools.partial(_fold, config, world, k, context)
