@@ -140,13 +140,6 @@ def check_arms(world: TouchWorld, policy: ActivePolicy, arms: Mapping[str, Arm])
         check_exploration(policy, bank, every, prices=arm.prices, budget=arm.budget)
 
 
-def warm_start(
-    world: TouchWorld, policy: ActivePolicy, config: LearnerConfig, contacts: int, seed: int, context: Context
-) -> SeedPolicy:
-    """SFT on touches drawn at random, and look-ups in what the policy then believes about validation objects."""
-    return looked_up(world, policy, warm_params(world, policy, config, contacts, seed, context), config, contacts)
-
-
 def looked_up(
     world: TouchWorld, policy: ActivePolicy, params: Params, config: LearnerConfig, contacts: int
 ) -> SeedPolicy:

@@ -65,15 +65,6 @@ def probe_table(contacts: ContactsConfig, beliefs: Beliefs, title: str, note: st
     return named_table(title, rows, note=f"{note} Sensors in the order {', '.join(contacts.sensors)}; the best force.")
 
 
-def first_motions(contacts: ContactsConfig, played: Sequence[Played]) -> Float[np.ndarray, "A M"]:
-    """Share of first contacts of each motion by question, over objects and seeds; rows with no contact sum to less."""
-    return (
-        first_choices(contacts, played)
-        .reshape(len(PROPERTIES), len(contacts.sensors), len(contacts.motions), -1)
-        .sum((1, 3))
-    )
-
-
 def first_choices(contacts: ContactsConfig, played: Sequence[Played]) -> Float[np.ndarray, "A C"]:
     """Share of first contacts of each choice by question."""
     first = np.concatenate([p.choices[..., 0] for p in played])  # n A
@@ -107,7 +98,8 @@ def first_touch_picture(contacts: ContactsConfig, played: Sequence[Played], beli
 
 def procedures_table(contacts: ContactsConfig, played: Sequence[Played], beliefs: Beliefs) -> Table:
     """First motion by question next to the probes' best motion and to what people do."""
-    share = first_motions(contacts, played)
+    shape = (len(PROPERTIES), len(contacts.sensors), len(contacts.motions), -1)
+    share = first_choices(contacts, played).reshape(shape).sum((1, 3))
     rows: list[dict[str, Cell]] = []
     for a, name in enumerate(PROPERTIES):
         by = motion_accuracy(contacts, beliefs, a)
