@@ -368,7 +368,6 @@ def _promise_picture(promises: Sequence[PromiseCheck]) -> Picture:
     )
 
 
-DEFAULT = TangentialConfig()
 SMOKE = TangentialConfig(
     contacts=2,
     sensors=("xense", "dmtac_x"),
@@ -380,4 +379,4 @@ SMOKE = TangentialConfig(
     coupled_bodies=1,
 )
 
-EXPERIMENT = Experiment(name="pareto_tangential", config=DEFAULT, scales={"smoke": SMOKE}, run=run)
+EXPERIMENT = Experiment(name="pareto_tangential", config=TangentialConfig(), scales={"smoke": SMOKE}, run=run)
