@@ -26,7 +26,6 @@ from experiments.core.text import bounds, number
 from experiments.study.estimates import compare_over_objects, compare_over_seeds, estimate
 from experiments.study.training import preset_name
 from touchr1_jax.bench.metrics import Scores
-from touchr1_jax.bench.statistics import Interval
 from touchr1_jax.text.language import EXPLORED_ATTRIBUTES
 from touchr1_jax.training.exploration import NO_CHOICE
 
@@ -316,13 +315,11 @@ def price_table(found: Mapping[str, Played], arms: Mapping[str, Arm]) -> Table:
 
 def curves(
     seeds: Seeds, estimates: Mapping[str, Mapping[str, Estimate]], contacts: int, learner: LearnerConfig
-) -> dict[str, list[tuple[float, Interval]]]:
+) -> dict[str, list[tuple[float, Estimate]]]:
     """Accuracy over seconds of every plan."""
 
-    def point(name: str) -> tuple[float, Interval]:
-        one = estimates[name][METRIC]
-        seconds = float(np.mean([f[name].seconds.mean() for f in seeds if name in f]))
-        return seconds, Interval(mean=one.mean, low=one.low, high=one.high)
+    def point(name: str) -> tuple[float, Estimate]:
+        return float(np.mean([f[name].seconds.mean() for f in seeds if name in f])), estimates[name][METRIC]
 
     several = counted("chosen", contacts)
     found = {"chosen by the policy": [point("chosen"), point(several)]}

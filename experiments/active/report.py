@@ -8,11 +8,11 @@ from jaxtyping import Float, Int
 from experiments.active.contacts import PROPERTIES, ContactsConfig
 from experiments.active.headroom import EVERY, PLANS, Beliefs, single
 from experiments.active.plans import Played
-from experiments.core.charts import Panel, Series, draw
+from experiments.core.charts import Panel, draw, estimates
 from experiments.core.pictures import Heatmap, heatmaps, image_grid
-from experiments.core.results import Cell, Picture, Table, named_table
+from experiments.core.results import Cell, Estimate, Picture, Table, named_table
 from experiments.study.estimates import RESAMPLES
-from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
+from touchr1_jax.bench.statistics import clustered_bootstrap
 from touchr1_jax.training.exploration import NO_CHOICE
 
 PROCEDURES: Mapping[str, str] = {
@@ -153,17 +153,10 @@ def found_questions(contacts: ContactsConfig, played: Played, beliefs: Beliefs) 
     return [name for a, name in enumerate(PROPERTIES) if found(a)]
 
 
-def seconds_picture(points: Mapping[str, Sequence[tuple[float, Interval]]]) -> Picture:
+def seconds_picture(points: Mapping[str, Sequence[tuple[float, Estimate]]]) -> Picture:
     """Accuracy over seconds of touch: plan → its (seconds, accuracy in %)."""
     series = [
-        Series(
-            name,
-            x=[s for s, _ in row],
-            y=[i.mean for _, i in row],
-            low=[i.low for _, i in row],
-            high=[i.high for _, i in row],
-            line="-" if len(row) > 1 else "",
-        )
+        estimates(name, [found for _, found in row], at=[s for s, _ in row], line="-" if len(row) > 1 else "")
         for name, row in points.items()
     ]
     never = any(s == 0 for row in points.values() for s, _ in row)  # a policy that never touches

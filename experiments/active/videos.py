@@ -19,7 +19,7 @@ from experiments.active.arms import TOUCHES, as_json, check_warm_start, from_jso
 from experiments.active.encoder import belief_scale, belief_tokens
 from experiments.active.plans import Answer, Played, play, same_for_all, until_sure
 from experiments.active.policies import answerer, explore, part_of, reinforce, warm_up
-from experiments.core.charts import Panel, Series, draw
+from experiments.core.charts import Panel, draw, estimates
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
 from experiments.core.results import Picture, Table, named_table
@@ -263,16 +263,8 @@ def video_picture(config: StoppingConfig, played: Mapping[str, Played]) -> Pictu
     series = []
     for title, names in groups.items():
         found = [accuracy(played[name]) for name in names]
-        series.append(
-            Series(
-                title,
-                x=[float(played[name].contacts.mean()) for name in names],
-                y=[i.mean for i in found],
-                low=[i.low for i in found],
-                high=[i.high for i in found],
-                line="-" if len(names) > 1 else "",
-            )
-        )
+        at = [float(played[name].contacts.mean()) for name in names]
+        series.append(estimates(title, found, at=at, line="-" if len(names) > 1 else ""))
     panel = Panel(series, x_label="videos a question, mean", y_label="right about unseen objects, %")
     return Picture(
         name="real_touch",
