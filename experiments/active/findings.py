@@ -109,7 +109,7 @@ def compared(
     found = []
     for a, b in pairs:
         if len(scores[a]) > 1:
-            found.append(compare_over_seeds(METRIC, a, b, estimates[a][METRIC], estimates[b][METRIC]))
+            found.append(compare_over_seeds(METRIC, a, b, *(estimates[name][METRIC].per_seed for name in (a, b))))
         found.append(compare_over_objects(METRIC, a, b, scores[a], scores[b], objects))
     return tuple(found)
 
