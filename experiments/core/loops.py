@@ -52,15 +52,9 @@ def stage_hooks(
       describe: of the sample that a step returns, what people see; without it no step returns one.
     """
     times, logs, left_out = LoopTime(), list[Log](), [0.0]
-    folder = context.checkpoint_dir(stage)
+    folder, of = context.checkpoint_dir(stage), labelled(context.directory, stage)
     with (
-        Checkpoints(
-            folder,
-            KEPT,
-            better="higher" if scored else None,
-            print_=context.print,
-            of=labelled(context.directory, stage),
-        ) as checkpoints,
+        Checkpoints(folder, KEPT, better="higher" if scored else None, print_=context.print, of=of) as checkpoints,
         context.timed(stage),
         context.stopping.patient(context.processes.any) as stopping,
         context.compiling(stage.rpartition("/")[0]) as compiled,  # all seeds run one program
