@@ -132,7 +132,7 @@ def patch_statistics(frames: UInt8[Array, "C F H W 3"]) -> Float[Array, "C D"]:
 def of_contacts(
     what: str, read: Callable[[UInt8[np.ndarray, "C F H W 3"]], Array], bank: ContactBank, context: Context
 ) -> Float[np.ndarray, "O C ..."]:
-    """What a program reads in the frames of all contacts of an object, for every object."""
+    """Output of a program that reads the frames of all contacts of an object, for every object."""
     with context.progress(f"{what} of contacts", len(bank.frames)) as advance:
         return np.stack(in_threads(lambda frames: np.asarray(read(frames)), bank.frames, advance))
 
