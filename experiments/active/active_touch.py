@@ -52,7 +52,7 @@ from experiments.active.arms import (
     of_equal_seconds,
     one_step_look_ahead,
     reinforced,
-    warm_start,
+    warm_params,
     with_dropout,
 )
 from experiments.active.contacts import PROPERTIES, ContactsConfig
@@ -163,7 +163,8 @@ def _seed(
 ) -> tuple[dict[str, Played], SeedPolicy, list[Table]]:
     """Actions of all plans and policies of a seed about test objects, its warm start, and of the first the headroom."""
     learner = config.learner
-    warm = warm_start(world, policy, learner, config.contacts, seed, context)
+    params = warm_params(world, policy, learner, config.contacts, seed, context)
+    warm = looked_up(world, policy, params, learner, config.contacts)
     tables = []
     found = controls(world, warm, learner, config.contacts, seed)
     if seed == 0:
@@ -234,7 +235,6 @@ def _print(table: Table, context: Context) -> None:
         context.print("  " + ", ".join("–" if x is None else x if isinstance(x, str) else f"{x:.1f}" for x in row))
 
 
-DEFAULT = ActiveTouchConfig()
 SMOKE = ActiveTouchConfig(
     world=WorldConfig(
         contacts=ContactsConfig(
@@ -257,7 +257,7 @@ SMOKE = ActiveTouchConfig(
 
 EXPERIMENT = Experiment(
     name="active_touch",
-    config=DEFAULT,
+    config=ActiveTouchConfig(),
     scales={"smoke": SMOKE},
     run=run,
     curves={"grpo": ("accuracy", "reward", "first_kind_information", "actions", "seconds", "harm"), "warm": ("loss",)},

@@ -140,13 +140,6 @@ def check_arms(world: TouchWorld, policy: ActivePolicy, arms: Mapping[str, Arm])
         check_exploration(policy, bank, every, prices=arm.prices, budget=arm.budget)
 
 
-def warm_start(
-    world: TouchWorld, policy: ActivePolicy, config: LearnerConfig, contacts: int, seed: int, context: Context
-) -> SeedPolicy:
-    """SFT on touches drawn at random, and look-ups in what the policy then believes about validation objects."""
-    return looked_up(world, policy, warm_params(world, policy, config, contacts, seed, context), config, contacts)
-
-
 def looked_up(
     world: TouchWorld, policy: ActivePolicy, params: Params, config: LearnerConfig, contacts: int
 ) -> SeedPolicy:
@@ -182,10 +175,9 @@ def controls(world: TouchWorld, warm: SeedPolicy, config: LearnerConfig, contact
     bank, objects, look = world.bank, world.parts["test"], warm.look
     n, questions = len(objects), bank.label.shape[1]
     rng = np.random.default_rng([seed, contacts])
-    offered = np.ones((n, questions, len(bank.choices)), bool)
     made = {"no_touch": np.full((n, questions, 1), NO_CHOICE, np.int32)}
     for k in range(1, contacts + 1):
-        made[counted("random", k)] = at_random(offered, k, rng)
+        made[counted("random", k)] = at_random((n, questions, len(bank.choices)), k, rng)
         made[counted("best_press", k)] = same_for_all(look.press[k], n, questions)
         made[counted("best_fixed", k)] = same_for_all(look.fixed[k], n, questions)
         made[counted("by_question", k)] = same_for_question(look.by_question[k], n)

@@ -129,10 +129,12 @@ def patch_statistics(frames: UInt8[Array, "C F H W 3"]) -> Float[Array, "C D"]:
     return jax.lax.map(of_contact, frames)  # one contact after the other stays in the processor's cache
 
 
-def contact_statistics(bank: ContactBank, context: Context) -> Float[np.ndarray, "O C D"]:
-    """`patch_statistics` of all contacts."""
-    with context.progress("statistics of contacts", len(bank.frames)) as advance:
-        return np.stack(in_threads(lambda frames: np.asarray(patch_statistics(frames)), bank.frames, advance))
+def of_contacts(
+    what: str, read: Callable[[UInt8[np.ndarray, "C F H W 3"]], Array], bank: ContactBank, context: Context
+) -> Float[np.ndarray, "O C ..."]:
+    """Output of a program that reads the frames of all contacts of an object, for every object."""
+    with context.progress(f"{what} of contacts", len(bank.frames)) as advance:
+        return np.stack(in_threads(lambda frames: np.asarray(read(frames)), bank.frames, advance))
 
 
 def belief_scale(log_probs: Float[np.ndarray, "*n A K"]) -> float:

@@ -26,7 +26,7 @@ from experiments.core.text import bounds, number
 from experiments.study.estimates import compare_over_objects, compare_over_seeds, estimate
 from experiments.study.training import preset_name
 from touchr1_jax.bench.metrics import Scores
-from touchr1_jax.bench.statistics import Interval
+from touchr1_jax.text.language import EXPLORED_ATTRIBUTES
 from touchr1_jax.training.exploration import NO_CHOICE
 
 METRIC = "acc"  # mean of the accuracy over the five properties
@@ -109,14 +109,14 @@ def compared(
     found = []
     for a, b in pairs:
         if len(scores[a]) > 1:
-            found.append(compare_over_seeds(METRIC, a, b, estimates[a][METRIC], estimates[b][METRIC]))
+            found.append(compare_over_seeds(METRIC, a, b, *(estimates[name][METRIC].per_seed for name in (a, b))))
         found.append(compare_over_objects(METRIC, a, b, scores[a], scores[b], objects))
     return tuple(found)
 
 
-def named(comparisons: Sequence[Comparison], a: str, b: str, over: str = "objects") -> Comparison:
-    """The comparison of two arms."""
-    return next(c for c in comparisons if (c.arm, c.against, c.over) == (a, b, over))
+def named(comparisons: Sequence[Comparison], a: str, b: str) -> Comparison:
+    """The comparison of two arms over objects."""
+    return next(c for c in comparisons if (c.arm, c.against, c.over) == (a, b, "objects"))
 
 
 def requirements(
@@ -315,13 +315,11 @@ def price_table(found: Mapping[str, Played], arms: Mapping[str, Arm]) -> Table:
 
 def curves(
     seeds: Seeds, estimates: Mapping[str, Mapping[str, Estimate]], contacts: int, learner: LearnerConfig
-) -> dict[str, list[tuple[float, Interval]]]:
+) -> dict[str, list[tuple[float, Estimate]]]:
     """Accuracy over seconds of every plan."""
 
-    def point(name: str) -> tuple[float, Interval]:
-        one = estimates[name][METRIC]
-        seconds = float(np.mean([f[name].seconds.mean() for f in seeds if name in f]))
-        return seconds, Interval(mean=one.mean, low=one.low, high=one.high)
+    def point(name: str) -> tuple[float, Estimate]:
+        return float(np.mean([f[name].seconds.mean() for f in seeds if name in f])), estimates[name][METRIC]
 
     several = counted("chosen", contacts)
     found = {"chosen by the policy": [point("chosen"), point(several)]}
@@ -343,7 +341,8 @@ def trajectories(world: TouchWorld, played: Played, most: int = 7) -> dict[str, 
         for k, choice in enumerate(played.choices[i, question]):
             if choice == NO_CHOICE or len(rows) >= most:
                 break
-            label = report.level_word(question, int(np.asarray(world.bank.label)[objects[i], question]))
+            level = int(np.asarray(world.bank.label)[objects[i], question])
+            label = EXPLORED_ATTRIBUTES[question].levels[level][0]
             outcome = "right" if played.right[i, question] else "wrong"
             words = choices[choice].words.replace(" ", "\n", 1)
             title = f"{PROPERTIES[question]}?\n{words}\n{label}: {outcome}\nobject {i}, touch {k + 1}"

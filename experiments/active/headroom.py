@@ -69,7 +69,7 @@ def headroom(
     """
     found = {(EVERY, 0): _each(score, lambda a: score.worth(a, tuple(range(score.log_probs.shape[1]))))}
     for count in range(1, contacts + 1):
-        fixed = best_fixed(find, count, kept)
+        fixed = best_sequence(find, list(find.questions), count, kept)
         trees = [best_tree(find, a, best_choices(find, [a], kept), count) for a in find.questions]
         sequences = [best_sequence(find, [a], count, kept) for a in find.questions]
         found[RANDOM, count] = _random(score, count)
@@ -90,11 +90,6 @@ def single(beliefs: Beliefs, question: int) -> Bool[np.ndarray, "n C"]:
     """Where the likeliest level after one contact is the true one, for every choice."""
     right: np.ndarray = beliefs.log_probs[:, :, question].argmax(-1) == beliefs.label[:, question, None]
     return right
-
-
-def best_fixed(beliefs: Beliefs, count: int, kept: int) -> tuple[int, ...]:
-    """The contacts that are best on average over the questions."""
-    return best_sequence(beliefs, list(beliefs.questions), count, kept)
 
 
 def best_sequence(beliefs: Beliefs, questions: list[int], count: int, kept: int) -> tuple[int, ...]:

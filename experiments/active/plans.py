@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from experiments.active.headroom import Beliefs, best_choices, best_sequence
 from touchr1_jax.rl.environment import TouchBank
@@ -87,10 +87,9 @@ def same_for_question(choices: Sequence[tuple[int, ...]], objects: int) -> Int[n
     return np.broadcast_to(rows, (objects, *rows.shape))
 
 
-def at_random(offered: Bool[np.ndarray, "O A C"], count: int, rng: np.random.Generator) -> Int[np.ndarray, "O A k"]:
-    """Different choices that are offered, drawn for every object and question."""
-    drawn = np.where(offered, rng.random(offered.shape), -1.0)
-    return np.argsort(-drawn, axis=-1)[..., :count].astype(np.int32)
+def at_random(shape: tuple[int, int, int], count: int, rng: np.random.Generator) -> Int[np.ndarray, "O A k"]:
+    """Different ones of C choices, drawn for every object and question; `shape` is (O, A, C)."""
+    return np.argsort(-rng.random(shape), axis=-1)[..., :count].astype(np.int32)
 
 
 def until_sure(

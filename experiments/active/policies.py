@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from experiments.active.encoder import DrawnFeed
 from experiments.active.plans import Answer, Played
@@ -111,18 +111,16 @@ def explore(
     bank: TouchBank,
     objects: Int[np.ndarray, "n"],
     budget: int,
-    offered: Bool[np.ndarray, "n A C"] | None = None,
 ) -> Played:
     """Greedy trajectories of a policy about every question of some objects."""
     label = np.asarray(bank.label)
     questions = label.shape[1]
     rows, asked = np.repeat(objects, questions), np.tile(np.arange(questions), len(objects))
-    free = np.ones((len(rows), bank.tokens.shape[1]), bool) if offered is None else offered.reshape(len(rows), -1)
     walk = _explorer(policy, budget)
     parts = []
     for start in range(0, len(rows), ROWS):
         at = np.minimum(np.arange(start, start + ROWS), len(rows) - 1)  # one shape, one program
-        batch = touch_batch_of(policy, bank, rows[at], asked[at], free[at])
+        batch = touch_batch_of(policy, bank, rows[at], asked[at])
         found = jax.device_get(walk(params, bank, batch, jax.random.key(0)))
         parts.append((found.action[:, 0], found.parsed.conclude[:, 0], found.seconds[:, 0], found.harm[:, 0]))
     action, level, seconds, harm = (np.concatenate(x)[: len(rows)] for x in zip(*parts, strict=True))

@@ -8,12 +8,11 @@ from jaxtyping import Float, Int
 from experiments.active.contacts import PROPERTIES, ContactsConfig
 from experiments.active.headroom import EVERY, PLANS, Beliefs, single
 from experiments.active.plans import Played
-from experiments.core.charts import Panel, Series, draw
+from experiments.core.charts import Panel, draw, estimates
 from experiments.core.pictures import Heatmap, heatmaps, image_grid
-from experiments.core.results import Cell, Picture, Table, named_table
+from experiments.core.results import Cell, Estimate, Picture, Table, named_table
 from experiments.study.estimates import RESAMPLES
-from touchr1_jax.bench.statistics import Interval, clustered_bootstrap
-from touchr1_jax.text.language import EXPLORED_ATTRIBUTES
+from touchr1_jax.bench.statistics import clustered_bootstrap
 from touchr1_jax.training.exploration import NO_CHOICE
 
 PROCEDURES: Mapping[str, str] = {
@@ -66,15 +65,6 @@ def probe_table(contacts: ContactsConfig, beliefs: Beliefs, title: str, note: st
     return named_table(title, rows, note=f"{note} Sensors in the order {', '.join(contacts.sensors)}; the best force.")
 
 
-def first_motions(contacts: ContactsConfig, played: Sequence[Played]) -> Float[np.ndarray, "A M"]:
-    """Share of first contacts of each motion by question, over objects and seeds; rows with no contact sum to less."""
-    return (
-        first_choices(contacts, played)
-        .reshape(len(PROPERTIES), len(contacts.sensors), len(contacts.motions), -1)
-        .sum((1, 3))
-    )
-
-
 def first_choices(contacts: ContactsConfig, played: Sequence[Played]) -> Float[np.ndarray, "A C"]:
     """Share of first contacts of each choice by question."""
     first = np.concatenate([p.choices[..., 0] for p in played])  # n A
@@ -108,7 +98,8 @@ def first_touch_picture(contacts: ContactsConfig, played: Sequence[Played], beli
 
 def procedures_table(contacts: ContactsConfig, played: Sequence[Played], beliefs: Beliefs) -> Table:
     """First motion by question next to the probes' best motion and to what people do."""
-    share = first_motions(contacts, played)
+    shape = (len(PROPERTIES), len(contacts.sensors), len(contacts.motions), -1)
+    share = first_choices(contacts, played).reshape(shape).sum((1, 3))
     rows: list[dict[str, Cell]] = []
     for a, name in enumerate(PROPERTIES):
         by = motion_accuracy(contacts, beliefs, a)
@@ -162,17 +153,10 @@ def found_questions(contacts: ContactsConfig, played: Played, beliefs: Beliefs) 
     return [name for a, name in enumerate(PROPERTIES) if found(a)]
 
 
-def seconds_picture(points: Mapping[str, Sequence[tuple[float, Interval]]]) -> Picture:
+def seconds_picture(points: Mapping[str, Sequence[tuple[float, Estimate]]]) -> Picture:
     """Accuracy over seconds of touch: plan → its (seconds, accuracy in %)."""
     series = [
-        Series(
-            name,
-            x=[s for s, _ in row],
-            y=[i.mean for _, i in row],
-            low=[i.low for _, i in row],
-            high=[i.high for _, i in row],
-            line="-" if len(row) > 1 else "",
-        )
+        estimates(name, [found for _, found in row], at=[s for s, _ in row], line="-" if len(row) > 1 else "")
         for name, row in points.items()
     ]
     never = any(s == 0 for row in points.values() for s, _ in row)  # a policy that never touches
@@ -200,8 +184,3 @@ def trajectory_picture(rows: Mapping[str, np.ndarray]) -> Picture:
         content=image_grid({name: list(frames) for name, frames in rows.items()}, cell_inch=1.1),
         kind="png",
     )
-
-
-def level_word(question: int, level: int) -> str:
-    """The word of a level."""
-    return EXPLORED_ATTRIBUTES[question].levels[level][0]

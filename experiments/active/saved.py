@@ -41,7 +41,6 @@ from touchr1_jax.models.qwen.weights import SINGLE
 from touchr1_jax.models.saved_policy import PolicyError, format_of
 from touchr1_jax.models.stacked import restacked, unstacked
 from touchr1_jax.rl.environment import TouchBank, TouchChoice
-from touchr1_jax.text.language import EXPLORED_ATTRIBUTES
 from touchr1_jax.training.exploration import NO_CHOICE
 from touchr1_jax.types import Params
 
@@ -82,7 +81,7 @@ class Explorer:
         The policy is greedy, so that a trajectory that goes on repeats its beginning.
         """
         shape = (1, len(self.contacts.choices))
-        tokens = np.zeros((*shape, len(PROPERTIES), len(PROPERTIES) + self._levels), np.float32)
+        tokens = np.zeros((*shape, len(PROPERTIES), len(PROPERTIES) + LEVELS), np.float32)
         made, felt = np.zeros(shape, bool), np.zeros(shape, bool)
         while True:
             bank = self._bank(tokens, felt)
@@ -96,10 +95,6 @@ class Explorer:
         answer = answerer(self.policy, self.params, bank)
         level = np.exp(answer(np.zeros(1, int), np.array([question]), chosen[None]))[0]
         return Exploration(tuple(int(c) for c in chosen if c != NO_CHOICE), level / level.sum())
-
-    @property
-    def _levels(self) -> int:
-        return len(EXPLORED_ATTRIBUTES[0].levels)
 
     def _bank(self, tokens: np.ndarray, felt: np.ndarray) -> TouchBank:
         """The contacts of the object so far."""

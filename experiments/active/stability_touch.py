@@ -29,7 +29,7 @@ from experiments.active.world import TouchWorld, WorldConfig, make_world
 from experiments.core.concurrency import concurrently
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
-from experiments.core.loops import ALARM
+from experiments.core.loops import by_stage, fired_alarms
 from experiments.core.metric_log import read_metrics
 from experiments.core.results import Requirement, Results, Table, at_least, named_table
 from experiments.core.runner import Experiment
@@ -83,7 +83,8 @@ def run(config: StabilityTouchConfig, context: Context) -> Results:
     trained = dict(zip(seeds, concurrently(context, "seeds", seeds, train), strict=True))
     played = {seed: one for seed, (one, _) in trained.items()}
     found = {seed: questions for seed, (_, questions) in trained.items()}
-    alarms = alarms_of(context)
+    stages = by_stage(read_metrics(context.directory))
+    alarms = {seed: list(fired_alarms(stages.get(f"grpo/{NAME}/{seed}", []))) for seed in played}
     return Results(
         verdict=(verdict(found, alarms),),
         requirements=requirements(found),
@@ -106,19 +107,6 @@ def _one_seed(
     return as_json({NAME: explore(policy, params, world.bank, world.parts["test"], 1)})
 
 
-def alarms_of(context: Context) -> dict[int, dict[str, int]]:
-    """Seed → code of each alarm that rang in its reinforcement → the first step."""
-    found: dict[int, dict[str, int]] = {}
-    for line in read_metrics(context.directory):
-        kind, _, seed = line["stage"].rpartition("/")
-        if kind == f"grpo/{NAME}":
-            of_seed = found.setdefault(int(seed), {})
-            for name in line:
-                if name.startswith(ALARM):
-                    of_seed.setdefault(name.removeprefix(ALARM), line["step"])
-    return found
-
-
 def requirements(found: dict[int, list[str]]) -> tuple[Requirement, ...]:
     """The share of seeds that find enough."""
     enough = 100 * float(np.mean([len(names) >= ENOUGH for names in found.values()]))
@@ -126,7 +114,7 @@ def requirements(found: dict[int, list[str]]) -> tuple[Requirement, ...]:
     return (at_least(f"seeds whose first motion is the probes' for {ENOUGH} of 5 questions", enough, SHARE, "%", note),)
 
 
-def verdict(found: dict[int, list[str]], alarms: dict[int, dict[str, int]]) -> str:
+def verdict(found: dict[int, list[str]], alarms: dict[int, list[str]]) -> str:
     """Seeds that find enough, and alarms."""
     enough = sum(len(names) >= ENOUGH for names in found.values())
     rang = [f"{code} in seed {seed}" for seed, codes in alarms.items() for code in codes]
@@ -137,7 +125,7 @@ def verdict(found: dict[int, list[str]], alarms: dict[int, dict[str, int]]) -> s
 
 
 def seed_table(
-    world: TouchWorld, played: dict[int, Played], found: dict[int, list[str]], alarms: dict[int, dict[str, int]]
+    world: TouchWorld, played: dict[int, Played], found: dict[int, list[str]], alarms: dict[int, list[str]]
 ) -> Table:
     """First motion by question in every seed, a star where it is not the probes'."""
     motions = [motion for _, motion, _ in world.config.contacts.choices]
@@ -149,7 +137,7 @@ def seed_table(
             first = max(sorted(set(touched)), key=touched.count) if touched else "none"
             row[name] = first if name in found[seed] else f"{first} *"
         right, touches = 100 * float(one.right.mean()), float(one.contacts.mean())
-        rows.append(row | {"right": right, "touches": touches, "alarms": " ".join(alarms.get(seed, {})) or "none"})
+        rows.append(row | {"right": right, "touches": touches, "alarms": " ".join(alarms[seed]) or "none"})
     return named_table(
         "First motion in every seed",
         rows,

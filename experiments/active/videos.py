@@ -19,7 +19,7 @@ from experiments.active.arms import TOUCHES, as_json, check_warm_start, from_jso
 from experiments.active.encoder import belief_scale, belief_tokens
 from experiments.active.plans import Answer, Played, play, same_for_all, until_sure
 from experiments.active.policies import answerer, explore, part_of, reinforce, warm_up
-from experiments.core.charts import Panel, Series, draw
+from experiments.core.charts import Panel, draw, estimates
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
 from experiments.core.results import Picture, Table, named_table
@@ -111,13 +111,8 @@ class VideoWorld:
     fold: Int[np.ndarray, "n"]
 
 
-def read_videos(config: StoppingConfig, source: Path, context: Context) -> VideoWorld:
-    """The labelled objects of PhysiCLeAR's layout that have enough videos."""
-    return world_of(config, describe_source(source, config.frames, context).labelled())
-
-
 def world_of(config: StoppingConfig, videos: DescribedVideos) -> VideoWorld:
-    """Videos by object, in an order drawn by the seed."""
+    """The objects that have enough videos, and those of each in an order drawn by the seed."""
     names, count = np.unique(videos.objects, return_counts=True)
     names = names[count >= config.videos]
     rng = np.random.default_rng(config.seed)
@@ -148,7 +143,7 @@ def bank_of(world: VideoWorld, tested: Int[np.ndarray, "n"], seed: int) -> Touch
 
 def stopping(config: StoppingConfig, source: Path, context: Context) -> tuple[Table, Picture]:
     """Accuracy against the number of videos: policies, a random number, so many for all, thresholds on belief."""
-    world = read_videos(config, source, context)
+    world = world_of(config, describe_source(source, config.frames, context).labelled())
     folds: list[Mapping[str, Played]] = []
     for k in context.each("folds of videos", range(config.folds)):
         compute = functools.partial(_fold, config, world, k, context)
@@ -268,16 +263,8 @@ def video_picture(config: StoppingConfig, played: Mapping[str, Played]) -> Pictu
     series = []
     for title, names in groups.items():
         found = [accuracy(played[name]) for name in names]
-        series.append(
-            Series(
-                title,
-                x=[float(played[name].contacts.mean()) for name in names],
-                y=[i.mean for i in found],
-                low=[i.low for i in found],
-                high=[i.high for i in found],
-                line="-" if len(names) > 1 else "",
-            )
-        )
+        at = [float(played[name].contacts.mean()) for name in names]
+        series.append(estimates(title, found, at=at, line="-" if len(names) > 1 else ""))
     panel = Panel(series, x_label="videos a question, mean", y_label="right about unseen objects, %")
     return Picture(
         name="real_touch",

@@ -17,12 +17,12 @@ from experiments.active.encoder import (
     ContactReader,
     belief_scale,
     belief_tokens,
-    contact_statistics,
+    of_contacts,
+    patch_statistics,
     read_contacts,
     train_reader,
 )
 from experiments.active.headroom import Beliefs
-from experiments.core.concurrency import in_threads
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
 from experiments.study.cache import fingerprint
@@ -42,12 +42,6 @@ def frame_features(frames: UInt8[Array, "C F H W 3"]) -> Float[Array, "C F D"]:
         return jnp.concatenate([x.reshape(len(frames), -1) for x in parts], -1)
 
     return jax.lax.map(of_contact, frames)  # one contact after the other stays in the processor's cache
-
-
-def contact_features(bank: ContactBank, context: Context) -> Float[np.ndarray, "O C F D"]:
-    """`frame_features` of all contacts."""
-    with context.progress("features of contacts", len(bank.frames)) as advance:
-        return np.stack(in_threads(lambda frames: np.asarray(frame_features(frames)), bank.frames, advance))
 
 
 def probe_beliefs(
@@ -174,7 +168,8 @@ def _encoded(
 ) -> dict[str, Any]:
     """Tokens, and beliefs of encoders, probes and both; no object that trains is read by what learned from it."""
     fitted = np.concatenate([parts["warm"], parts["reinforced"]])
-    features, statistics = contact_features(made, context), contact_statistics(made, context)
+    features = of_contacts("features", frame_features, made, context)
+    statistics = of_contacts("statistics", patch_statistics, made, context)
     with context.timed("probes"):
         probes = crossed(lambda learned, _: probe_beliefs(features, made.label, learned, context), fitted)
     readers: list[ContactReader] = []

@@ -220,11 +220,10 @@ def _answer_chart(shares: Sequence[card.AnswerShare]) -> bytes:
     return draw([panel])
 
 
-DEFAULT = DatasetCardConfig()
 SMOKE = DatasetCardConfig(
     scenes=SceneConfig(objects=60, sites=1),
     quota=Quota(identify=96, scale=36, compose=32, compare=24, order=18, one_sensor=32, conflict=16),
     faulty=60,
 )
 
-EXPERIMENT = Experiment(name="dataset_card", config=DEFAULT, scales={"smoke": SMOKE}, run=run)
+EXPERIMENT = Experiment(name="dataset_card", config=DatasetCardConfig(), scales={"smoke": SMOKE}, run=run)

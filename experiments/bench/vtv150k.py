@@ -30,8 +30,8 @@ from experiments.core.look import PALETTE, SHARED
 from experiments.core.results import Cell, Picture, Results, Table, named_table
 from experiments.core.runner import Experiment
 from experiments.core.text import bounds, interval
-from experiments.mechanics.identify_motions import MotionData, contacts_of, motion_data
-from experiments.mechanics.identify_probes import transfer
+from experiments.mechanics.identify_motions import MOTIONS, MotionData, contacts_of, motion_data
+from experiments.mechanics.identify_probes import FORCE, transfer
 from experiments.study import paper_numbers as paper
 from experiments.study.paper_numbers import differences_table
 from sensors_io.live import LiveScenes
@@ -43,11 +43,8 @@ from touchr1_jax.bench.statistics import Interval
 from touchr1_jax.bench.vtv import ATTRIBUTES, CHANCE
 from touchr1_jax.training.linear_probe import ProbeConfig
 
-MOTIONS = ("slide_x", "hold")
-"""One that reveals friction, one that reveals the returned energy; both reveal the other attributes."""
-
 FUSED, WITH_FORCE = "all sensors", "all sensors and force"
-FORCE, SHAPE, PRIOR = "force alone", "true shape", "commonest"
+SHAPE, PRIOR = "true shape", "commonest"
 
 Scored = Mapping[str, Mapping[str, Interval]]  # predictor → task, and "average"
 

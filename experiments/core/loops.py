@@ -17,6 +17,8 @@ STEPPING, WAITING = "in steps", "waiting for data"
 
 ALARM = "alarm_"  # prefix of the logged metrics that hold alarms, followed by their code
 
+KEPT = 2  # newest checkpoints of a stage
+
 COMPILING = "compiling the first step"  # note beside the bar of a stage until its first step is done
 
 MakeLog = Callable[[Context, str, int], Log]
@@ -50,11 +52,9 @@ def stage_hooks(
       describe: of the sample that a step returns, what people see; without it no step returns one.
     """
     times, logs, left_out = LoopTime(), list[Log](), [0.0]
-    folder = context.checkpoint_dir(stage)
+    folder, of = context.checkpoint_dir(stage), labelled(context.directory, stage)
     with (
-        Checkpoints(
-            folder, better="higher" if scored else None, print_=context.print, of=labelled(context.directory, stage)
-        ) as checkpoints,
+        Checkpoints(folder, KEPT, better="higher" if scored else None, print_=context.print, of=of) as checkpoints,
         context.timed(stage),
         context.stopping.patient(context.processes.any) as stopping,
         context.compiling(stage.rpartition("/")[0]) as compiled,  # all seeds run one program
@@ -100,13 +100,27 @@ def _tell(context: Context, stage: str, times: LoopTime, left_out: float) -> Non
         context.print(f"{stage}: {ms:.3g} ms a step, {times.input_share:.2%} of it {WAITING}")
 
 
-def left_out_tables(lines: Iterable[Mapping[str, Any]]) -> tuple[Table, ...]:
-    """A table of the updates and groups that training left out for a number that was not finite, if there were any."""
+def by_stage(lines: Iterable[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
+    """The lines of `metrics.jsonl` of each stage."""
     stages: dict[str, list[Mapping[str, Any]]] = {}
     for line in lines:
         stages.setdefault(line["stage"], []).append(line)
+    return stages
+
+
+def fired_alarms(lines: Iterable[Mapping[str, Any]]) -> dict[str, list[int]]:
+    """Code of each alarm that fired → the steps of these lines at which it did."""
+    steps: dict[str, list[int]] = {}
+    for line in lines:
+        for name in (name for name in line if name.startswith(ALARM)):
+            steps.setdefault(name.removeprefix(ALARM), []).append(line["step"])
+    return steps
+
+
+def left_out_tables(lines: Iterable[Mapping[str, Any]]) -> tuple[Table, ...]:
+    """A table of the updates and groups that training left out for a number that was not finite, if there were any."""
     rows = []
-    for stage, of_stage in stages.items():
+    for stage, of_stage in by_stage(lines).items():
         terms = sorted({name for line in of_stage for name in line if name.startswith(NONFINITE_IN)})
         share = {name: sum(line.get(name, 0.0) for line in of_stage) / len(of_stage) for name in terms}
         updates = max(line.get(SKIPPED, 0.0) for line in of_stage)
@@ -119,13 +133,10 @@ def left_out_tables(lines: Iterable[Mapping[str, Any]]) -> tuple[Table, ...]:
 
 def alarm_tables(lines: Iterable[Mapping[str, Any]]) -> tuple[Table, ...]:
     """A table of the alarms of training, if any fired."""
-    steps: dict[tuple[str, str], list[int]] = {}
-    for line in lines:
-        for name in (name for name in line if name.startswith(ALARM)):
-            steps.setdefault((line["stage"], name.removeprefix(ALARM)), []).append(line["step"])
     rows = [
         {"stage": stage, "alarm": code, "first at step": min(at), "steps": len(at)}
-        for (stage, code), at in sorted(steps.items())
+        for stage, of_stage in sorted(by_stage(lines).items())
+        for code, at in sorted(fired_alarms(of_stage).items())
     ]
     note = "docs/GLOSSARY.md says what a code means; the console named the number and its bound."
     return (named_table("Alarms of training", rows, note=note),) if rows else ()

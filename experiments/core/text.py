@@ -95,8 +95,8 @@ def duration(seconds: float) -> str:
     return f"{whole // HOUR} h {whole % HOUR // MINUTE} min"
 
 
-def aligned(rows: Sequence[Sequence[str]], gap: str = "  ") -> str:
+def aligned(rows: Sequence[Sequence[str]]) -> str:
     """Rows of cells as lines of text, the columns left-aligned."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = (gap.join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)) for row in rows)
+    lines = ("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)) for row in rows)
     return "\n".join(line.rstrip() for line in lines)

@@ -122,12 +122,12 @@ class LivePage(Watcher):
             self._due = self._clock() + PAGE_EVERY_S
 
     @contextlib.contextmanager
-    def kept_fresh(self, every_s: float = PAGE_EVERY_S) -> Iterator[None]:
+    def kept_fresh(self) -> Iterator[None]:
         """Write the page from a thread also while the block is silent, as in a compilation: it is never 30 s old."""
         ended = threading.Event()
 
         def watch() -> None:
-            while not ended.wait(every_s):
+            while not ended.wait(PAGE_EVERY_S):
                 with contextlib.suppress(OSError):  # a full disk ends the run elsewhere
                     self.write_if_due(curves=False)
 

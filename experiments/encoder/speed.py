@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.core.timing import interleaved
+from experiments.core.timing import median_ms
 from touchr1_jax.models.tactile_vit import TactileViTConfig, cut_patches, kept_patches, patch_tokens
 from touchr1_jax.training.dynamics import DynamicsConfig, encode_each, read_frames
 from touchr1_jax.types import Params, TouchBatch
@@ -100,7 +100,5 @@ def arithmetic(function: Callable[..., Any], *arguments: Any) -> float:
 
 def medians(programs: Mapping[str, CompiledProgram], rounds: Iterable[object]) -> dict[str, float]:
     """Median seconds of each, in interleaved rounds."""
-    for program in programs.values():
-        jax.block_until_ready(program.call())
-    seconds = interleaved({name: program.call for name, program in programs.items()}, rounds)
-    return {name: float(np.median(s)) for name, s in seconds.items()}
+    ms = median_ms({name: program.call for name, program in programs.items()}, rounds)
+    return {name: one / 1e3 for name, one in ms.items()}

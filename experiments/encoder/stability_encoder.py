@@ -279,7 +279,6 @@ def collapse_chart(outcomes: list[CollapseOutcome], block_steps: int) -> bytes:
     return draw(panels, size=(10.2, 3.9))
 
 
-DEFAULT = StabilityEncoderConfig()
 SMOKE = StabilityEncoderConfig(
     touch=StageOneDataConfig(scenes=SceneConfig(objects=60, sites=1, image_px=28, seed=1)),
     seeds=2,
@@ -288,4 +287,4 @@ SMOKE = StabilityEncoderConfig(
     block_steps=2,
 )
 
-EXPERIMENT = Experiment(name="stability_encoder", config=DEFAULT, scales={"smoke": SMOKE}, run=run)
+EXPERIMENT = Experiment(name="stability_encoder", config=StabilityEncoderConfig(), scales={"smoke": SMOKE}, run=run)

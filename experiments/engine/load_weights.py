@@ -176,7 +176,6 @@ def table(readings: Measured) -> Table:
     )
 
 
-DEFAULT = LoadWeightsConfig()
 SMOKE = LoadWeightsConfig(sizes=("0.5B",), compare=())
 
-EXPERIMENT = Experiment(name="load_weights", config=DEFAULT, scales={"smoke": SMOKE}, run=run)
+EXPERIMENT = Experiment(name="load_weights", config=LoadWeightsConfig(), scales={"smoke": SMOKE}, run=run)

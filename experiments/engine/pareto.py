@@ -17,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from experiments.core.charts import dominated
 from experiments.core.context import Context
 from experiments.core.errors import require
 from experiments.core.recorded import RECORDED_RUN, recorded_names, recorded_run
@@ -80,10 +81,6 @@ class ParetoPoint(NamedTuple):
     name: str
     at: tuple[float, ...]
 
-    def beats(self, other: "ParetoPoint") -> bool:
-        """True if it is better on one axis and worse on none."""
-        return all(a <= b for a, b in zip(self.at, other.at, strict=True)) and self.at != other.at
-
 
 class DefaultJudgement(NamedTuple):
     """A default on one table of a run: all measured points, and those that dominate it (`None`: not measured)."""
@@ -104,10 +101,10 @@ def run(config: GatherConfig, context: Context) -> Results:
     missing = [name for name in names if name not in runs]
     recorded = [name for name, past in runs.items() if past.directory.name == RECORDED_RUN]
     judgements = [j for judged in DEFAULTS if judged.experiment in runs for j in judge(judged, runs[judged.experiment])]
-    dominated = at_most("defaults that are dominated", sum(bool(j.dominated_by) for j in judgements), 0)
+    requirement = at_most("defaults that are dominated", sum(bool(j.dominated_by) for j in judgements), 0)
     return Results(
         verdict=verdict(judgements, recorded, missing),
-        requirements=(dominated,) if judgements else (),
+        requirements=(requirement,) if judgements else (),
         tables=(
             default_table(judgements),
             choice_table(judgements),
@@ -171,17 +168,19 @@ def row_names(table: Mapping[str, Any]) -> list[str]:
 
 
 def front(points: Sequence[ParetoPoint]) -> tuple[ParetoPoint, ...]:
-    """The points that no other point beats, in their order."""
-    return tuple(p for p in points if not any(other.beats(p) for other in points))
+    """The points that no other point dominates, in their order."""
+    beaten = dominated([p.at for p in points])
+    return tuple(p for p, is_beaten in zip(points, beaten, strict=True) if not is_beaten)
 
 
 def dominators(name: str, points: Sequence[ParetoPoint]) -> tuple[ParetoPoint, ...] | None:
-    """The points that beat the named one, those of the front first; `None` where it was not measured."""
+    """The points that dominate the named one, those of the front first; `None` where it was not measured."""
     named = next((p for p in points if p.name == name), None)
     if named is None:
         return None
     best = front(points)
-    return tuple(sorted((p for p in points if p.beats(named)), key=lambda p: p not in best))
+    by = (p for p in points if dominated([named.at, p.at])[0])
+    return tuple(sorted(by, key=lambda p: p not in best))
 
 
 def choice_table(judgements: Sequence[DefaultJudgement]) -> Table:
@@ -198,7 +197,7 @@ def choice_table(judgements: Sequence[DefaultJudgement]) -> Table:
 
 def verdict(judgements: Sequence[DefaultJudgement], recorded: Sequence[str], missing: Sequence[str]) -> tuple[str, ...]:
     """Name the dominated defaults, the methods that dominate them, and the experiments that have not run here."""
-    dominated = [
+    beaten = [
         f"The default of {j.judged.what}, {j.judged.default}, is dominated in '{j.title}' by {_names(j.dominated_by)}."
         for j in judgements
         if j.dominated_by
@@ -206,7 +205,7 @@ def verdict(judgements: Sequence[DefaultJudgement], recorded: Sequence[str], mis
     none = [f"None of {len(judgements)} judgements finds a default dominated."] if judgements else []
     elsewhere = [f"Not run here, so by the recorded result: {', '.join(recorded)}."] if recorded else []
     unmeasured = [f"Neither run here nor recorded, so left out: {', '.join(missing)}."] if missing else []
-    return (*(dominated or none), *elsewhere, *unmeasured)
+    return (*(beaten or none), *elsewhere, *unmeasured)
 
 
 def _names(points: Sequence[ParetoPoint]) -> str:

@@ -272,7 +272,6 @@ def reward_over_time(target: float, curves: Curves) -> bytes:
     return draw(panels, share_x=True, share_y=True)
 
 
-DEFAULT = ParetoGrpoConfig()
 SMOKE = ParetoGrpoConfig(
     algorithms=("paper", "DAPO"), groups=(2,), rollouts=4, prefix=16, steps=2, timed=1, seeds=1,
     size=JobSize(length=4, vocab_size=32, hidden_size=16, num_layers=1, num_heads=1, num_kv_heads=1, head_dim=16),
@@ -280,4 +279,4 @@ SMOKE = ParetoGrpoConfig(
     effort=TrainingBudget(pretrain_steps=4, pretrain_batch=8, steps=4, prompts=2, group=4, examined=8, answers=2),
 )  # fmt: skip
 
-EXPERIMENT = Experiment(name="pareto_grpo", config=DEFAULT, scales={"smoke": SMOKE}, run=run)
+EXPERIMENT = Experiment(name="pareto_grpo", config=ParetoGrpoConfig(), scales={"smoke": SMOKE}, run=run)

@@ -193,7 +193,6 @@ def memory_table(reserved: int, counted: int, device: jax.Device) -> Table:
     )
 
 
-DEFAULT = gpu.GpuConfig()
 SMOKE = gpu.GpuConfig(
     anywhere=True, rounds=2, side=64, prompts=1, tokens=24, heads=4, kv_heads=2, head_dim=8, flash="xla", streams=2,
     frames=4, contacts=1, tactile=TactileViTConfig(sensors=0, width=16, num_layers=1, num_heads=2, stem_width=4),
@@ -208,4 +207,4 @@ SMOKE = gpu.GpuConfig(
     ),
 )  # fmt: skip
 
-EXPERIMENT = Experiment(name="speed_gpu", config=DEFAULT, scales={"smoke": SMOKE}, run=run)
+EXPERIMENT = Experiment(name="speed_gpu", config=gpu.GpuConfig(), scales={"smoke": SMOKE}, run=run)

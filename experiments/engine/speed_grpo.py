@@ -187,7 +187,6 @@ def measure_peers(config: SpeedConfig, peers: Sequence[Peer], context: Context) 
     return found, tuple(failed)
 
 
-DEFAULT = SpeedConfig()
 SMOKE = SpeedConfig(
     prefixes=(16,), rounds=2, options=("importance weights", "short answers, buckets"), options_at=16,
     repeated_at=(16,), buckets=(4,), words=0, steps=300,
@@ -196,4 +195,4 @@ SMOKE = SpeedConfig(
     ),
 )  # fmt: skip
 
-EXPERIMENT = Experiment(name="speed_grpo", config=DEFAULT, scales={"smoke": SMOKE}, run=run)
+EXPERIMENT = Experiment(name="speed_grpo", config=SpeedConfig(), scales={"smoke": SMOKE}, run=run)

@@ -365,7 +365,6 @@ def failure_picture(outcomes: Sequence[ScenarioOutcome]) -> Picture:
 
 
 SMOKE_BUDGET = TrainingBudget(pretrain_steps=4, pretrain_batch=8, steps=22, prompts=2, group=4, examined=8, answers=2)
-DEFAULT = StabilityGrpoConfig()
 SMOKE = StabilityGrpoConfig(effort=SMOKE_BUDGET, seeds=2, codes=("F3",), most_values=2)
 
-EXPERIMENT = Experiment(name="stability_grpo", config=DEFAULT, scales={"smoke": SMOKE}, run=run)
+EXPERIMENT = Experiment(name="stability_grpo", config=StabilityGrpoConfig(), scales={"smoke": SMOKE}, run=run)

@@ -23,12 +23,11 @@ from experiments.core.results import Requirement, Results, Table, at_most, named
 from experiments.core.runner import Experiment
 from experiments.engine.load_checkpoints import SHAPES
 from experiments.engine.processes import in_own_process
-from experiments.engine.step_shapes import StepShape, compiled_step, run_step
+from experiments.engine.step_shapes import GB, StepShape, compiled_step, run_step
 from touchr1_jax.models.qwen.config import QwenVisionConfig
 from touchr1_jax.validation import at_least
 
 STAGES = ("SFT", "GRPO")
-GB = 1e9
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -356,7 +356,6 @@ def verdict(config: FeedingConfig, fed: Sequence[FeedMeasurement]) -> tuple[str,
     )
 
 
-DEFAULT = FeedingConfig()
 TINY_STUDY = dataclasses.replace(studies.SMOKE, clip_memory_gib=0.002)
 SMOKE = FeedingConfig(
     scales={"smoke": FeedScale(study=TINY_STUDY, devices=2, contacts=24)},
@@ -365,4 +364,6 @@ SMOKE = FeedingConfig(
     steps=3,
 )
 
-EXPERIMENT = Experiment(name="throughput_feed", config=DEFAULT, scales={"smoke": SMOKE}, run=run, quick=("smoke",))
+EXPERIMENT = Experiment(
+    name="throughput_feed", config=FeedingConfig(), scales={"smoke": SMOKE}, run=run, quick=("smoke",)
+)

@@ -13,10 +13,10 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from experiments.core.artifacts import read_json
+from experiments.core.loops import KEPT
 from touchr1_jax.training.checksums import old_checkpoints
 
 STATE = "state of "  # begins the name of the digest of a stage's checkpoints
-KEPT = 2  # newest checkpoints of a stage, see `Checkpoints`
 
 
 def digests(directory: Path) -> dict[str, str]:

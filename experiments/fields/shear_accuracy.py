@@ -16,6 +16,7 @@ from experiments.core.context import Context
 from experiments.core.results import Cell, Picture, ReportPart, Table, at_most, named_table
 from experiments.core.timing import median_ms
 from experiments.fields.generated_slides import NODES, Slide, cached_slides, make_slides, node_grid, pressing
+from experiments.mechanics.tangential_scenes import KINDS
 from sensors_io.arrays import load_arrays
 from sensors_io.clock import NS_PER_S
 from sensors_io.fields import total_force
@@ -37,8 +38,8 @@ gradient-free reading on seeds 700 and 800.
 LAYERS = ((1.0, 0.48), (1.0, 0.45), (0.7, 0.48), (0.7, 0.45), (1.3, 0.48), (1.3, 0.45))
 """True thickness over the assumed one, and true Poisson ratio; the readings assume (1, 0.48)."""
 
-KINDS, MOTIONS, FRAMES = ("sphere", "rough", "patterned"), ("press", "slide_x", "slide_y", "twist"), 36
-"""Objects, contacts and frames of the slides."""
+MOTIONS, FRAMES = ("press", "slide_x", "slide_y", "twist"), 36
+"""Contacts and frames of the slides."""
 
 STRIDE, ROUNDS = 3, 9  # every how many-th frame is scored; rounds of timing
 ShearMethod = Callable[[Slide, int], np.ndarray]  # from a slide and the index of a frame to its shear [h, w, 2], mm

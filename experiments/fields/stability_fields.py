@@ -79,9 +79,8 @@ def run(config: FieldStabilityConfig, context: Context) -> Results:
     return assemble(parts, settings, silent)
 
 
-DEFAULT = FieldStabilityConfig()
 SMOKE = FieldStabilityConfig(
     gels=1, seeds=1, methods=(OURS, "LK to rest", "dots, nearest"), slide_frames=18, ball_presses=10, pictures=4
 )
 
-EXPERIMENT = Experiment(name="stability_fields", config=DEFAULT, scales={"smoke": SMOKE}, run=run)
+EXPERIMENT = Experiment(name="stability_fields", config=FieldStabilityConfig(), scales={"smoke": SMOKE}, run=run)

@@ -321,9 +321,8 @@ def _picture(trials: Sequence[ChooserTrial]) -> Picture:
     )
 
 
-DEFAULT = ChooserConfig()
 SMOKE = ChooserConfig(
     batch=8, fitted_batches=1, tested_batches=1, sensors=1, sequences=4, grids=(24, 32, 48), asked=(0.1, 0.2)
 )
 
-EXPERIMENT = Experiment(name="pareto_chooser", config=DEFAULT, scales={"smoke": SMOKE}, run=run)
+EXPERIMENT = Experiment(name="pareto_chooser", config=ChooserConfig(), scales={"smoke": SMOKE}, run=run)

@@ -204,7 +204,6 @@ def _pictures(rows: Rows, ladder: Mapping[int, Mapping[str, float]]) -> tuple[Pi
     )
 
 
-DEFAULT = ParetoContactConfig()
 SMOKE = ParetoContactConfig(scenes=8, grid=64, ladder=(24, 32, 64), ladder_scenes=4, rounds=3, oracle_scenes=2)
 
-EXPERIMENT = Experiment(name="pareto_contact", config=DEFAULT, scales={"smoke": SMOKE}, run=run)
+EXPERIMENT = Experiment(name="pareto_contact", config=ParetoContactConfig(), scales={"smoke": SMOKE}, run=run)

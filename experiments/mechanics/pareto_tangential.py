@@ -37,7 +37,7 @@ from experiments.mechanics.tangential_checks import PromiseCheck
 from experiments.mechanics.tangential_methods import FROM_PRESS, MAIN, METHODS, PLAIN, SEQUENCE, SOLVER, SUPERPOSED
 from experiments.mechanics.tangential_scenes import FrictionContact, FrictionKernels, FrictionSequence
 from sensors_io.scenes import partial_slip
-from sensors_io.scenes.sensors import BODY
+from sensors_io.scenes.sensors import BODY, SensorModel
 from sensors_io.schema import SENSORS
 
 TITLES = {
@@ -91,7 +91,7 @@ class TangentialConfig:
 class GelContacts:
     """One sensor's gel, the contacts on it with their kinds, its sequences."""
 
-    name: str
+    sensor: SensorModel
     kernels: FrictionKernels
     cases: FrictionContact
     kinds: tuple[str, ...]
@@ -181,7 +181,7 @@ def make_gels(config: TangentialConfig, context: Context) -> tuple[GelContacts, 
             scenes.make_motion(kernels, body, name, config.frames)
             for body, name in zip(bodies, config.motions, strict=True)
         )
-        gels.append(GelContacts(name=sensor.name, kernels=kernels, cases=cases, kinds=kinds, sequences=sequences))
+        gels.append(GelContacts(sensor=sensor, kernels=kernels, cases=cases, kinds=kinds, sequences=sequences))
     return tuple(gels)
 
 
@@ -222,13 +222,13 @@ def check_promises(gels: Sequence[GelContacts], superposed: MethodErrors) -> lis
     """The superposition's error and promise on every contact."""
     errors = iter(superposed.errors.tolist())
     found = []
-    for gel, sensor in zip(gels, scenes.sensors(tuple(gel.name for gel in gels)), strict=True):
+    for gel in gels:
         pressures, moduli = np.asarray(gel.cases.ramp_mpa[:, -1]), np.asarray(gel.cases.modulus_mpa)
         for kind, pressure, modulus in zip(gel.kinds, pressures, moduli, strict=True):
             radius = scenes.contact_radius_mm(pressure, float(gel.kernels.spacing_mm))
             body = dataclasses.replace(BODY, modulus_mpa=float(modulus))
-            promised = partial_slip.promised_error(sensor.gel, body, radius)
-            found.append(PromiseCheck(kind=kind, sensor=sensor.name, error=next(errors), promised=promised))
+            promised = partial_slip.promised_error(gel.sensor.gel, body, radius)
+            found.append(PromiseCheck(kind=kind, sensor=gel.sensor.name, error=next(errors), promised=promised))
     return found
 
 
@@ -368,7 +368,6 @@ def _promise_picture(promises: Sequence[PromiseCheck]) -> Picture:
     )
 
 
-DEFAULT = TangentialConfig()
 SMOKE = TangentialConfig(
     contacts=2,
     sensors=("xense", "dmtac_x"),
@@ -380,4 +379,4 @@ SMOKE = TangentialConfig(
     coupled_bodies=1,
 )
 
-EXPERIMENT = Experiment(name="pareto_tangential", config=DEFAULT, scales={"smoke": SMOKE}, run=run)
+EXPERIMENT = Experiment(name="pareto_tangential", config=TangentialConfig(), scales={"smoke": SMOKE}, run=run)

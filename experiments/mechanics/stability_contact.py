@@ -316,9 +316,8 @@ def _failure_map(
     )
 
 
-DEFAULT = StabilityContactConfig()
 SMOKE = StabilityContactConfig(
     grid=32, adhesion_grid=64, scenes=40, forces_n=(0.01, 1.0), roughness=(0.0, 2.0), thickness_mm=(0.3, 5.0)
 )
 
-EXPERIMENT = Experiment(name="stability_contact", config=DEFAULT, scales={"smoke": SMOKE}, run=run)
+EXPERIMENT = Experiment(name="stability_contact", config=StabilityContactConfig(), scales={"smoke": SMOKE}, run=run)

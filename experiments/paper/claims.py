@@ -15,9 +15,8 @@ import numpy as np
 from experiments.core.recorded import value_at
 from experiments.core.text import number
 from experiments.study import paper_numbers as paper
+from sensors_io.schema import ATTRIBUTES
 from touchr1_jax.bench.statistics import Interval, student_interval
-
-ATTRIBUTES = ("hardness", "roughness", "protrusion", "material")
 
 ClaimVerdict = Literal["holds", "does not hold", "undecided", "contradicts itself"]
 
@@ -77,19 +76,21 @@ class Claim:
     fixed: ClaimVerdict | None = None
 
 
-def _ladder(
-    name: str, arm: str, against: str, row: str, below: str, omae: bool = False, csc: bool = False
-) -> ClaimedChange:
-    """A step of the paper's ladder in OMAE, in CSC, or in the mean of the four accuracies."""
-    column = 0 if omae else 1 if csc else 2
+LADDER = {"OMAE": ("omae",), "CSC": ("csc",), "Avg of four": FOUR}
+"""Columns of the paper's ladder, in its order → metrics, whose mean it is."""
+
+
+def _ladder(name: str, arm: str, against: str, row: str, below: str) -> ClaimedChange:
+    """A step of the paper's ladder in one of its columns."""
+    column, lower = list(LADDER).index(name), name == "OMAE"
     return ClaimedChange(
         name=name,
         paper=paper.LADDER[row][column] - paper.LADDER[below][column],
-        metrics=("omae",) if omae else ("csc",) if csc else FOUR,
+        metrics=LADDER[name],
         arm=arm,
         against=against,
-        spec="+.3f" if omae else "+.1f",
-        better="lower" if omae else "higher",
+        spec="+.3f" if lower else "+.1f",
+        better="lower" if lower else "higher",
     )
 
 
@@ -126,13 +127,13 @@ CLAIMS: tuple[Claim, ...] = (
     Claim(
         text="The ordinal reward lowers OMAE",
         experiment="ablation_cumulative",
-        changes=(_ladder("OMAE", "ordinal", "zero_one", "+ Ordinal Reward", "+ GRPO (0/1)", omae=True),),
+        changes=(_ladder("OMAE", "ordinal", "zero_one", "+ Ordinal Reward", "+ GRPO (0/1)"),),
         why="Near misses earn a part of the reward, but answers do not become better by it.",
     ),
     Claim(
         text="The consistency reward raises cross-sensor consistency",
         experiment="ablation_cumulative",
-        changes=(_ladder("CSC", "consistency", "ordinal", "+ Consistency Reward", "+ Ordinal Reward", csc=True),),
+        changes=(_ladder("CSC", "consistency", "ordinal", "+ Consistency Reward", "+ Ordinal Reward"),),
         why="It rewards equal slots, so slots copy each other; conclusions from single sensors stay the same.",
     ),
     Claim(
@@ -151,8 +152,8 @@ CLAIMS: tuple[Claim, ...] = (
         text="The whole objective lowers OMAE and raises CSC over SFT",
         experiment="ablation_cumulative",
         changes=(
-            _ladder("OMAE", "grounding", "sft", FULL_ROW, SFT_ROW, omae=True),
-            _ladder("CSC", "grounding", "sft", FULL_ROW, SFT_ROW, csc=True),
+            _ladder("OMAE", "grounding", "sft", FULL_ROW, SFT_ROW),
+            _ladder("CSC", "grounding", "sft", FULL_ROW, SFT_ROW),
         ),
         why="The policy stays near SFT, which the likelihood of verified answers in the objective anchors.",
     ),

@@ -9,7 +9,7 @@ import numpy as np
 from experiments.core.charts import Panel, Rule, Series, draw, estimates
 from experiments.core.context import Context
 from experiments.core.look import PALETTE, SHARED
-from experiments.core.loops import ALARM
+from experiments.core.loops import ALARM, by_stage, fired_alarms
 from experiments.core.metric_log import read_metrics
 from experiments.core.results import Estimate, Picture, Results, Table, named_table
 from experiments.core.text import bounds, interval, number
@@ -44,14 +44,11 @@ class TrainingHistory:
 
 def training_history(lines: Iterable[Mapping[str, Any]], arm: str) -> TrainingHistory | None:
     """The training of an arm from the lines of `metrics.jsonl`; `None` where GRPO did not train it."""
-    stages: dict[str, list[Mapping[str, Any]]] = {}
-    for line in lines:
-        if line["stage"].startswith(f"grpo/{arm}/"):
-            stages.setdefault(line["stage"], []).append(line)
+    stages = by_stage(line for line in lines if line["stage"].startswith(f"grpo/{arm}/"))
     if not stages:
         return None
     seeds = [sorted(rows, key=lambda line: line["step"]) for rows in stages.values()]
-    fired = [{name.removeprefix(ALARM) for line in rows for name in line if name.startswith(ALARM)} for rows in seeds]
+    fired = [fired_alarms(rows) for rows in seeds]
     return TrainingHistory(
         start=_means([rows[:START] for rows in seeds]),
         end=_means([rows[-WINDOW:] for rows in seeds]),

@@ -273,7 +273,7 @@ def report(
     """Learning curves, their differences, and where each method pays."""
     rows = estimate_rows(scored, objects)
     pairs = [pair for count in counts for pair in compared_pairs(count)]
-    comparisons = [c for pair in pairs for c in compare_rows(*pair, COMPARED, scored, rows, objects)]
+    comparisons = [c for pair in pairs for c in compare_rows(*pair, COMPARED, scored, objects)]
     return Results(
         verdict=verdict(comparisons, counts),
         arms=rows,

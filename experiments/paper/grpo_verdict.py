@@ -214,7 +214,7 @@ def report(
 ) -> Results:
     """One short table with paired intervals, and a verdict on the claim."""
     rows, others = estimate_rows(scored, objects), [name for name in scored if name != CONTINUED]
-    comparisons = [c for name in others for c in compare_rows(name, CONTINUED, COMPARED, scored, rows, objects)]
+    comparisons = [c for name in others for c in compare_rows(name, CONTINUED, COMPARED, scored, objects)]
     return Results(
         verdict=verdict(comparisons, list(rates)),
         arms=rows,

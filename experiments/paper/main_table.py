@@ -140,7 +140,7 @@ def against(rows: Mapping[str, Mapping[str, Estimate]], one: str, other: str) ->
     """One row against another in the columns of the table, paired by seed; needs two seeds at least."""
     a, b = rows[one], rows[other]
     compared = [m for m in (*AVERAGED, "avg") if m in a and m in b and len(a[m].per_seed) > 1]
-    return [compare_over_seeds(m, one, other, a[m], b[m]) for m in compared]
+    return [compare_over_seeds(m, one, other, a[m].per_seed, b[m].per_seed) for m in compared]
 
 
 def verdict(rows: Mapping[str, Mapping[str, Estimate]], comparisons: Sequence[Comparison]) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from experiments.core.charts import Panel, Series, draw
+from experiments.core.charts import Panel, Series, dominated, draw
 from experiments.core.context import Context
 from experiments.core.loops import STEPPING
 from experiments.core.results import Cell, Picture, Results, Table, named_table
@@ -50,10 +50,10 @@ class ParetoSFTConfig:
     decoder: tuple[int, ...] = (300, 900)
 
     def __post_init__(self) -> None:
-        for field, least in (("encoders", 1), ("end_to_end", 1), ("decoder", 1)):
+        for field in ("encoders", "end_to_end", "decoder"):
             lengths = getattr(self, field)
-            if not lengths or min(lengths) < least:
-                raise ValueError(f"{field} is {lengths}: must hold lengths of at least {least} steps; add or raise one")
+            if not lengths or min(lengths) < 1:
+                raise ValueError(f"{field} is {lengths}: must hold lengths of at least 1 steps; add or raise one")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -143,12 +143,10 @@ def validation_scores(seed: StudySeed, params: Params, validation: Validation) -
 
 
 def efficient(found: Mapping[Lengths, PhaseResult]) -> list[Lengths]:
-    """Lengths that none beats in accuracy with as many seconds or fewer, by rising seconds."""
-    kept: list[Lengths] = []
-    for length in sorted(found, key=lambda x: (found[x].seconds, -found[x].accuracy)):
-        if not kept or found[length].accuracy > found[kept[-1]].accuracy:
-            kept.append(length)
-    return kept
+    """Lengths that no other dominates in seconds and accuracy, by rising seconds."""
+    beaten = dominated([(result.seconds, -result.accuracy) for result in found.values()])
+    kept = (length for length, is_beaten in zip(found, beaten, strict=True) if not is_beaten)
+    return sorted(kept, key=lambda length: found[length].seconds)
 
 
 def phase_table(found: Mapping[Lengths, PhaseResult]) -> Table:

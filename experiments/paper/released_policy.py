@@ -94,9 +94,7 @@ def require_same(source: Path, context: Context) -> None:
       WeightsError: a file changed, came or went.
     """
     marks = file_marks(source)
-    if not context.done("weights"):
-        context.save_stage("weights", marks)
-    began = context.load_stage("weights")
+    began = context.once("weights", lambda: marks)
     changed = sorted(name for name in {*began, *marks} if began.get(name) != marks.get(name))
     if changed:
         raise WeightsError(

@@ -41,16 +41,15 @@ by the same training without touch, and 34 % by a constant.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 
 from experiments.core.context import Context
 from experiments.core.progress import in_megabytes
-from experiments.core.results import Comparison, Estimate, Results, at_most
+from experiments.core.results import Estimate, Results, at_most
 from experiments.core.runner import Experiment
 from experiments.core.text import interval
 from experiments.paper import released_policy as released
@@ -65,7 +64,7 @@ from experiments.paper.touch_gain import (
 )
 from experiments.study.controls import decision_table, seconds_table
 from experiments.study.dataset import Dataset
-from experiments.study.estimates import compare_over_objects, compare_over_seeds, estimate
+from experiments.study.estimates import compare_rows, estimate
 from experiments.study.examples import rollout_examples
 from experiments.study.levels import level_report
 from experiments.study.scores import PUBLISHED, score, score_study, study_results, study_settings
@@ -74,7 +73,6 @@ from experiments.study.study import BLIND, CONTINUED, SFT, EvalVariant, check_ar
 from experiments.study.training import TrainingConfig, open_data, require_encoder, starting_model
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS
-from touchr1_jax.bench.metrics import Scores
 from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.load import WeightsError, load_checkpoint
 from touchr1_jax.models.lora import LoraConfig
@@ -100,6 +98,9 @@ TAUGHT = (
 )
 
 COMPARED = ("acc", "omae", "csc", "mat_acc")
+
+PAIRS = ((ARM, SFT), (ARM, CONTINUED), (SFT, ZERO), (SFT, BLIND), (SFT, "constant"))
+"""Each step of training, and the earlier one or the baseline that it is compared with."""
 
 GRPO = dataclasses.replace(
     GRPOConfig.paper(), prompts=16, micro_prompts=2, length=96, lr_scale=10.0, bfloat16=True, remat=True
@@ -194,7 +195,7 @@ def run(config: TouchR1Config, context: Context) -> Results:
     scored = score_study(study)
     zero = [score(study, answers) for answers in study.variants[ZERO]]
     zero_shot = {metric: estimate([seed[metric] for seed in zero], scored.objects) for metric in zero[0]}
-    baselines = {ZERO: zero_shot, **scored.baselines}
+    baselines, rows = {ZERO: zero_shot, **scored.baselines}, {**scored.rows, ZERO: zero}
     pictures, tables = level_report(study)
     gain = study_touch_gain(study, ARM)
     both = zip(study.answers[ARM], study.variants[WRITTEN], strict=True)
@@ -210,7 +211,7 @@ def run(config: TouchR1Config, context: Context) -> Results:
             "rollouts": config.rollouts.url or "by the step",
             "adapters": f"rank {config.lora.rank} on {', '.join((*config.lora.targets, *config.lora.vision_targets))}",
         },
-        comparisons=tuple(compared({**scored.rows, ZERO: zero}, scored.objects, config.seeds)),
+        comparisons=tuple(c for pair in PAIRS for c in compare_rows(*pair, COMPARED, rows, scored.objects)),
         verdict=verdict(config, {**scored.arms, **baselines}, gain),
         requirements=(at_most("answers of the written policy that differ", differing, 0, note=of),),
         tables=(
@@ -273,21 +274,6 @@ def released_folder(config: TouchR1Config, context: Context) -> Path:
         context.processes.write_once(make)
         context.save_stage("tiny", {})
     return made
-
-
-def compared(rows: Mapping[str, Sequence[Mapping[str, Scores]]], objects: np.ndarray, seeds: int) -> list[Comparison]:
-    """Each step of training against an earlier one or a baseline, over objects, and over seeds where there are two."""
-    found = []
-    for a, b in ((ARM, SFT), (ARM, CONTINUED), (SFT, ZERO), (SFT, BLIND), (SFT, "constant")):
-        for metric in COMPARED:
-            if metric not in rows[a][0] or metric not in rows[b][0]:
-                continue
-            ours, theirs = ([seed[metric] for seed in rows[name]] for name in (a, b))
-            theirs = theirs * (len(ours) // len(theirs))
-            found.append(compare_over_objects(metric, a, b, ours, theirs, objects))
-            if seeds > 1:
-                found.append(compare_over_seeds(metric, a, b, estimate(ours, objects), estimate(theirs, objects)))
-    return found
 
 
 def verdict(

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from experiments.core import numerics
 from experiments.core.context import Context
-from experiments.recordings.scene_presses import press_pictures
+from experiments.recordings.scene_presses import PressVariant, press_pictures
 from sensors_io.errors import MALFORMED, told
 from sensors_io.importers.keep import ImportSourceError, Skip
 from sensors_io.importers.physiclear import read_labels
@@ -185,10 +185,15 @@ def describe_scenes(config: SceneConfig, context: Context) -> Float[np.ndarray, 
 
     def make() -> dict[str, np.ndarray]:
         with context.timed("scenes"):
-            every = context.each("generating and describing scenes", range(config.contact_count))
-            return {"x": np.array([describe(touch_of_scene(press_pictures(config, i))) for i in every])}
+            return {"x": described_presses(config, variant=PressVariant(), context=context)}
 
     return _cached(context, "scene-descriptions", [OF_SCENES, config_hash(config), families()], make)["x"]
+
+
+def described_presses(config: SceneConfig, *, variant: PressVariant, context: Context) -> Float[np.ndarray, "n D"]:
+    """Descriptions of a set of presses."""
+    every = context.each("generating and describing scenes", range(config.contact_count))
+    return np.array([describe(touch_of_scene(press_pictures(config, i, variant))) for i in every])
 
 
 def scene_properties(config: SceneConfig) -> tuple[Float[np.ndarray, "n T"], np.ndarray]:

@@ -42,10 +42,16 @@ from experiments.recordings.cross_validation import (
     require_divisions,
     scores,
 )
-from experiments.recordings.descriptions import DescribedVideos, auxiliary_data, describe_scenes, describe_source
+from experiments.recordings.descriptions import (
+    DescribedVideos,
+    auxiliary_data,
+    describe_scenes,
+    describe_source,
+    described_presses,
+)
 from experiments.recordings.findings import JudgedAnswers, gains
 from experiments.recordings.learning import LearnConfig
-from experiments.recordings.scene_presses import AS_GENERATED, VARIANTS, PressVariant, press_pictures
+from experiments.recordings.scene_presses import AS_GENERATED, VARIANTS, press_pictures
 from sensors_io.calibration.calibrate import calibrate
 from sensors_io.calibration.generated_presses import generated_presses
 from sensors_io.fields.depth import DepthReader
@@ -62,7 +68,6 @@ from sensors_io.touches import (
 )
 from touchr1_jax.bench.statistics import Interval
 
-SCORED = ("all right", "mean", "OMAE")
 NO_SCENES = "no scenes: probes of the videos alone"
 PICTURES, WITH_COURSE, FIELDS, BOTH = "pictures", "pictures and their course", "fields", "pictures and fields"
 SLOPE_GREY, DEPTH_GREY = 100.0, 100.0
@@ -163,12 +168,6 @@ def judged(log_prob: Sequence[Any], videos: DescribedVideos) -> JudgedAnswers:
     """Answers of probes, which are their own evidence."""
     labelled, rows = videos.labelled(), np.array(log_prob)
     return JudgedAnswers(log_prob=rows, evidence=rows, label=labelled.label, objects=labelled.objects)
-
-
-def described_presses(config: SceneConfig, *, variant: PressVariant, context: Context) -> Float[np.ndarray, "n D"]:
-    """Descriptions of a set of presses."""
-    every = context.each("generating and describing", range(config.contact_count))
-    return np.array([describe(touch_of_scene(press_pictures(config, i, variant))) for i in every])
 
 
 def read_inputs(

@@ -357,7 +357,6 @@ def _picture(number: int, kind: str, every: Sequence[CodecMeasurement]) -> Pictu
     )
 
 
-DEFAULT = StorageConfig()
 SMOKE = StorageConfig(
     scenes=SceneConfig(objects=4, sites=1, frames=8),
     contacts=1,
@@ -365,4 +364,4 @@ SMOKE = StorageConfig(
     feed=FeedConfig(scenes=SceneConfig(objects=4, sites=1), contacts=2, batch_size=4, batches=2, workers=(0,)),
 )
 
-EXPERIMENT = Experiment(name="pareto_storage", config=DEFAULT, scales={"smoke": SMOKE}, run=run)
+EXPERIMENT = Experiment(name="pareto_storage", config=StorageConfig(), scales={"smoke": SMOKE}, run=run)

@@ -247,7 +247,6 @@ def _ring_power(pictures: np.ndarray) -> np.ndarray:
     return np.array([power[np.round(ring) == k].mean(0) for k in rings]) + 1e-9
 
 
-DEFAULT = RealismConfig()
 SMOKE = RealismConfig(patches=8)
 
-EXPERIMENT = Experiment(name="scene_realism", config=DEFAULT, scales={"smoke": SMOKE}, run=run)
+EXPERIMENT = Experiment(name="scene_realism", config=RealismConfig(), scales={"smoke": SMOKE}, run=run)

@@ -32,6 +32,7 @@ from sensors_io.scenes.press import padded_size
 from sensors_io.scenes.protocol import plan
 from sensors_io.scenes.sensors import MODELS
 from sensors_io.schema import MATERIALS, PRESS_FORCE_N, SENSORS
+from touchr1_jax.bench.metrics import ORDINAL
 
 PAPER_OBJECTS, PAPER_SEQUENCES, PAPER_FRAMES = 1000, 14_700, 90
 PAPER_RECORDS = PAPER_SEQUENCES * PAPER_FRAMES
@@ -39,8 +40,6 @@ FEED_RATE, LARGE_RATE, WRITTEN_HOURS = 400, 150, 1.5
 """Requirements: records a second as a feed of ordinary and of large pictures; hours to write the paper's set."""
 
 KILLS, KILLED_RECORDS = 5, 20_000  # requirements on the killed writer: kills, records
-
-ORDINAL = ("hardness", "roughness", "protrusion")
 
 Parts = Mapping[str, Mapping[str, float]]  # sensor → part of the work → milliseconds of one core a record
 

@@ -115,7 +115,7 @@ def over_seeds(ablation: Ablation, study: Study, scored: Scored) -> list[Compari
         return []
     rows = scored.estimates
     found = [
-        compare_over_seeds(metric, a, b, rows[a][metric], rows[b][metric])
+        compare_over_seeds(metric, a, b, rows[a][metric].per_seed, rows[b][metric].per_seed)
         for a, b in dict.fromkeys([*ablation.pairs, *((arm, SFT) for arm in ablation.arms)])
         for metric in COMPARED
         if metric in rows[a]
@@ -126,15 +126,13 @@ def over_seeds(ablation: Ablation, study: Study, scored: Scored) -> list[Compari
     return found
 
 
-def own_reward(study: Study, seeds: Sequence[Evaluation], weights: Weights) -> Estimate:
-    """Mean reward under an arm's own weights of greedy answers to ordinal questions, of every seed; no interval."""
+def own_reward(study: Study, seeds: Sequence[Evaluation], weights: Weights) -> list[float]:
+    """Mean reward under an arm's own weights of greedy answers to ordinal questions, of every seed."""
     asked = [ATTRIBUTES.index(name) for name in ORDINAL]
-    each = tuple(
+    return [
         float(rewards_of(study.policy, answers, weights, study.prior)[np.isin(answers.attribute, asked)].mean())
         for answers in seeds
-    )
-    mean = float(np.mean(each))
-    return Estimate(mean=mean, ci95=(mean, mean), per_seed=each)
+    ]
 
 
 def over_objects(study: Study, scored: Scored) -> list[Comparison]:

@@ -29,7 +29,7 @@ def against_control(rows: Mapping[str, Mapping[str, Estimate]], arms: Iterable[s
     if any(len(estimate.per_seed) < 2 for estimate in control.values()):
         return []
     return [
-        compare_over_seeds(metric, arm, CONTINUED, rows[arm][metric], control[metric])
+        compare_over_seeds(metric, arm, CONTINUED, rows[arm][metric].per_seed, control[metric].per_seed)
         for arm in arms
         for metric in control
         if metric in rows[arm] and REPORTED[metric].better != "none" and not REPORTED[metric].secondary

@@ -77,31 +77,34 @@ def compare_rows(
     b: str,
     metrics: Iterable[str],
     scored: Mapping[str, SeedScores],
-    rows: Mapping[str, Mapping[str, Estimate]],
     objects: np.ndarray,
 ) -> list[Comparison]:
-    """One row against another in the metrics that both have, over objects and, where there are several, over seeds."""
+    """One row against another in the metrics that both have, over objects and, where there are several, over seeds.
+
+    A baseline of one seed is compared with every seed.
+    """
     found = []
     for metric in metrics:
-        if metric in rows[a] and metric in rows[b]:
+        if metric in scored[a][0] and metric in scored[b][0]:
             ours, theirs = ([scores[metric] for scores in scored[name]] for name in (a, b))
+            theirs = theirs * (len(ours) // len(theirs))
             found.append(compare_over_objects(metric, a, b, ours, theirs, objects))
-            if len(scored[a]) > 1:
-                found.append(compare_over_seeds(metric, a, b, rows[a][metric], rows[b][metric]))
+            if len(ours) > 1:
+                found.append(compare_over_seeds(metric, a, b, *([s.mean() for s in row] for row in (ours, theirs))))
     return found
 
 
-def compare_over_seeds(metric: str, arm: str, against: str, a: Estimate, b: Estimate) -> Comparison:
+def compare_over_seeds(metric: str, arm: str, against: str, a: Sequence[float], b: Sequence[float]) -> Comparison:
     """`arm` minus `against`, paired by seed: Student t interval, sign-flip p-value, probability of improvement.
 
-    The last is `None` for a metric that has no better direction.
+    The last is `None` for a metric that has no better direction; a and b are the value of every seed.
     """
-    counts = len(a.per_seed), len(b.per_seed)
+    counts = len(a), len(b)
     require(counts[0] == counts[1], f"{arm} and {against}", counts, "must have the same seeds", "run the missing ones")
-    difference = np.subtract(a.per_seed, b.per_seed)
+    difference = np.subtract(a, b)
     interval = statistics.student_interval(difference)
     better = REPORTED[metric].better
-    columns = [np.asarray(side.per_seed)[:, None] * (-1.0 if better == "lower" else 1.0) for side in (a, b)]
+    columns = [np.asarray(side)[:, None] * (-1.0 if better == "lower" else 1.0) for side in (a, b)]
     return Comparison(
         metric=metric,
         arm=arm,

@@ -94,7 +94,7 @@ RUNS = {
         lambda m: small(
             m.SMOKE,
             touch=StageOneDataConfig(scenes=small(tiny.SCENES, split_shares=(0.6, 0.2, 0.2))),
-            encoder=small(m.DEFAULT.encoder, width=8, num_layers=0, stem_px=4, stem_width=2),
+            encoder=small(m.EXPERIMENT.config.encoder, width=8, num_layers=0, stem_px=4, stem_width=2),
             batch_size=3, probe=PROBE,
         ),
         lambda m, r: len(rows(r)) == len(m.ARMS),

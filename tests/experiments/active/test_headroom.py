@@ -16,7 +16,6 @@ from experiments.active.headroom import (
     Tree,
     belief_class,
     best_choices,
-    best_fixed,
     best_sequence,
     best_tree,
     headroom,
@@ -51,7 +50,7 @@ def test_one_contact_by_question_beats_any_contact_for_both():
 def test_look_ups_rank_choices():
     assert best_choices(TWO_QUESTIONS, [0], 1) == [0]
     assert best_choices(TWO_QUESTIONS, [1], 1) == [1]
-    assert sorted(best_fixed(TWO_QUESTIONS, 2, 3)) == [0, 1]
+    assert sorted(best_sequence(TWO_QUESTIONS, [0, 1], 2, 3)) == [0, 1]
     assert best_sequence(TWO_QUESTIONS, [1], 1, 3) == (1,)
 
 

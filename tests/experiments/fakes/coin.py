@@ -46,7 +46,7 @@ def run(config: Config, context: Context) -> Results:
     objects = np.repeat(np.arange(10), 3)
     table = {arm: {m: estimate([s[m] for s in runs], objects) for m in runs[0]} for arm, runs in arms.items()}
     blind = {m: estimate([score(99, 0.3)[m]], objects) for m in ("acc", "omae", "middle_rate")}
-    over_seeds = compare_over_seeds("acc", "paid", "unpaid", table["paid"]["acc"], table["unpaid"]["acc"])
+    over_seeds = compare_over_seeds("acc", *arms, *(table[arm]["acc"].per_seed for arm in arms))
     pair = [[s["acc"] for s in arms[arm]] for arm in ("paid", "unpaid")]
     return Results(
         arms=table,
