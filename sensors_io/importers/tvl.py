@@ -48,7 +48,7 @@ def list_tvl(source: pathlib.Path, config: ImportConfig) -> Catalogue:
       ImportSourceError: no table there, or one without the columns.
     """
     found = (path for path in inside(source) if source in (path.parent, path.parent.parent))
-    tables = sorted(path for path in found if path.name in ("train.csv", "test.csv"))
+    tables = sorted(path for path in found if path.name.lower() in ("train.csv", "test.csv"))
     require_files(source, tables, "train.csv or test.csv, in it or in data1, data2, data3")
     trajectories, skipped = _trajectories(source, tables)
     contacts = []
@@ -75,6 +75,7 @@ def _trajectories(source: pathlib.Path, tables: list[pathlib.Path]) -> tuple[dic
     found: dict[str, list[_Pair]] = collections.defaultdict(list)
     skipped = []
     for table in tables:
+        name = table.name.lower()
         for row in read_table(table, COLUMNS):
             tactile, vision = pathlib.PurePosixPath(row["tactile"]), pathlib.PurePosixPath(row["url"])
             strays = (
@@ -90,7 +91,7 @@ def _trajectories(source: pathlib.Path, tables: list[pathlib.Path]) -> tuple[dic
                 continue
             part = "" if table.parent == source else f"{table.parent.name}-"
             pair = _Pair(
-                tactile=table.parent / tactile, vision=table.parent / vision, caption=row["caption"], table=table.name
+                tactile=table.parent / tactile, vision=table.parent / vision, caption=row["caption"], table=name
             )
             found[part + tactile.parts[0]].append(pair)
     if not found:

@@ -55,3 +55,8 @@ def test_a_sensor_that_is_missing_does_not_take_the_others_with_it(source, tmp_p
         "indoor-gone",
     }
     assert {skip.name for skip in report.skipped} == {"paper box/digit", "paper box/duragel/3.png", *rows}
+
+
+def test_a_part_without_its_table_is_named(source):
+    (source / "contact_fine.csv").unlink()
+    assert [skip.name for skip in list_tacquad(source, EVERYTHING).skipped] == ["data_fine"]
