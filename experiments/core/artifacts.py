@@ -19,6 +19,7 @@ import numpy as np
 
 from sensors_io.arrays import ArraysError, load_arrays
 from sensors_io.json_files import require_regular, seal, unseal
+from sensors_io.remote import at_url
 
 _OF = "of"  # entry of a file of arrays that says what they are
 
@@ -65,6 +66,8 @@ def jsonable(value: Any, where: str = "value") -> Any:
 def make_folder(folder: Path, option: str, value: Path) -> None:
     """Make a folder in the one that an option names; `UnwrittenError` if that is none or cannot be written."""
     try:
+        if at_url(value):  # a path of that name would be made here
+            raise OSError("it is a URL")
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise no_place(option, value, error) from error
