@@ -112,14 +112,14 @@ def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = Fa
     write_bytes(path, buffer.getvalue())
 
 
-def read_arrays(path: Path, of: str) -> dict[str, np.ndarray]:
-    """Arrays that `write_arrays` published; files of earlier versions do not say what they are.
+def read_arrays(path: Path, of: str, *, earlier: bool = True) -> dict[str, np.ndarray]:
+    """Arrays that `write_arrays` published; files of earlier versions, which `earlier` takes, do not say what they are.
 
     Raises:
       ArraysError: they cannot be read, or are of something else, as a whole file that was put in this place.
     """
     arrays = load_arrays(path)
-    said = str(arrays.pop(_OF, of))
+    said = str(arrays.pop(_OF, of if earlier else "something unnamed"))
     if said != of:
         raise ArraysError(f"{path} is of {said}: must be of {of}; put its own copy back, or remove it")
     return arrays
