@@ -273,11 +273,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print_in_any_encoding()
     command = tyro.cli(Command, args=arguments, prog="experiments.bench", config=(tyro.conf.OmitArgPrefixes,))
     try:
-        require_possible(command)
-    except ValueError as error:
-        complain(error)
-        return 2
-    try:
+        try:
+            require_possible(command)
+        except ValueError as error:
+            complain(error)
+            return 2
         return command.run()
     except KNOWN_ERRORS as error:
         complain(error)
