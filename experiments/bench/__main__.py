@@ -22,6 +22,7 @@ from experiments.bench.score_units import score_units
 from experiments.core.artifacts import read_json, write_json
 from experiments.core.text import number
 from sensors_io.commands.console import complain, print_in_any_encoding, progress_bar
+from sensors_io.commands.values import require_possible
 from sensors_io.errors import UserError
 from sensors_io.records import RecordStore
 from sensors_io.units import HERE, Launcher, finish
@@ -272,6 +273,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print_in_any_encoding()
     command = tyro.cli(Command, args=arguments, prog="experiments.bench", config=(tyro.conf.OmitArgPrefixes,))
     try:
+        try:
+            require_possible(command)
+        except ValueError as error:
+            complain(error)
+            return 2
         return command.run()
     except KNOWN_ERRORS as error:
         complain(error)

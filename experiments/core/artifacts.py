@@ -19,6 +19,7 @@ import numpy as np
 
 from sensors_io.arrays import ArraysError, load_arrays
 from sensors_io.json_files import require_regular, seal, unseal
+from sensors_io.remote import at_url
 
 _OF = "of"  # entry of a file of arrays that says what they are
 
@@ -65,6 +66,8 @@ def jsonable(value: Any, where: str = "value") -> Any:
 def make_folder(folder: Path, option: str, value: Path) -> None:
     """Make a folder in the one that an option names; `UnwrittenError` if that is none or cannot be written."""
     try:
+        if at_url(value):  # a path of that name would be made here
+            raise OSError("it is a URL")
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise no_place(option, value, error) from error
@@ -109,14 +112,14 @@ def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = Fa
     write_bytes(path, buffer.getvalue())
 
 
-def read_arrays(path: Path, of: str) -> dict[str, np.ndarray]:
-    """Arrays that `write_arrays` published; files of earlier versions do not say what they are.
+def read_arrays(path: Path, of: str, *, earlier: bool = True) -> dict[str, np.ndarray]:
+    """Arrays that `write_arrays` published; files of earlier versions, which `earlier` takes, do not say what they are.
 
     Raises:
       ArraysError: they cannot be read, or are of something else, as a whole file that was put in this place.
     """
     arrays = load_arrays(path)
-    said = str(arrays.pop(_OF, of))
+    said = str(arrays.pop(_OF, of if earlier else "something unnamed"))
     if said != of:
         raise ArraysError(f"{path} is of {said}: must be of {of}; put its own copy back, or remove it")
     return arrays

@@ -165,7 +165,7 @@ class ShowCommand:
 
         try:
             lines = show_recorded(self.name, entries[self.name].module, self.runs_dir)
-        except (FigureError, DamagedFileError) as error:
+        except (FigureError, DamagedFileError, OSError) as error:
             print_error(f"{type(error).__name__}: {error}")
             return 1
         print_lines(*lines)

@@ -287,7 +287,7 @@ class Context:
         path = self.cache_dir / f"{name}.npz"
         if path.exists():
             try:
-                return read_arrays(path, name)
+                return read_arrays(path, name, earlier=False)
             except ArraysError as error:
                 self.print(f"{error}: it is made again")
         write_arrays(path, make(), compressed=compressed, of=name)

@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.core.artifacts import DamagedFileError, fitting, read_json, write_json, write_text
+from experiments.core.artifacts import DamagedFileError, fitting, make_folder, read_json, write_json, write_text
 from experiments.core.report import write_report
 from experiments.core.results import from_json
 from experiments.core.runs import ROOT, PastRun
@@ -63,6 +63,7 @@ def _placeless(value: Any) -> Any:
 def show_recorded(name: str, module: str, runs_dir: Path) -> tuple[str, ...]:
     """Write the recorded results of an experiment as its report; the lines to print, `FigureError` without any."""
     past = recorded_run(name, runs_dir)
+    make_folder(past.directory, "runs-dir", runs_dir)
     source = ROOT / Path(*module.split(".")).with_suffix(".py")
     about = ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))) or name
     note = f"Recorded are figures alone; curves, pictures and examples come with a run: make experiment EXP={name}."

@@ -6,8 +6,11 @@ import pathlib
 from typing import Any
 
 from sensors_io.errors import UserError, path_text
+from sensors_io.remote import at_url
 
 PORTS = 65_535
+
+_WRITTEN = ("out", "html")  # options that name what a command writes
 
 MOST = 1e15
 """Beyond it no quantity of an option lies in its unit, and a time in seconds no clock can hold."""
@@ -16,7 +19,8 @@ MOST = 1e15
 def require_possible(value: Any, where: str = "") -> None:
     """Refuse numbers that are no quantity, times below 0, ports beyond the last, pipes and devices, in all fields.
 
-    A pipe or a device is read without end, or not at all, and an output is renamed onto its path.
+    A pipe or a device is read without end, or not at all, and an output is renamed onto its path.  For an output at a
+    URL a folder of that name would be made here.
 
     Args:
       value: the command, or one of its fields.
@@ -32,6 +36,8 @@ def require_possible(value: Any, where: str = "") -> None:
     elif isinstance(value, tuple):
         for each in value:
             require_possible(each, where)
+    elif isinstance(value, pathlib.Path) and where in _WRITTEN and at_url(value):
+        raise ValueError(f"{where} is {value}: must be a path on this machine; name one (`push` uploads records)")
     elif isinstance(value, pathlib.Path) and _in_circle(value):
         raise ValueError(f"{where} is {value}: its symbolic links lead in a circle; correct them, or name another path")
     elif isinstance(value, pathlib.Path) and value.exists() and not (value.is_file() or value.is_dir()):

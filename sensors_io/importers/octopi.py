@@ -24,7 +24,7 @@ import numpy as np
 from sensors_io.errors import MALFORMED
 from sensors_io.importers.catalogue import Catalogue, Listed, Taken, fingerprint, require_files
 from sensors_io.importers.keep import ImportSourceError, Keep, Skip
-from sensors_io.importers.pictures import film, natural, nominal_ns, numbered, read_pictures
+from sensors_io.importers.pictures import film, inside, natural, nominal_ns, numbered, read_pictures
 from sensors_io.schema import UNKNOWN, ContactKey, ObjectCard, SchemaError
 
 SENSOR = "gelsight_mini"
@@ -41,15 +41,20 @@ RATED = ("hardness", "roughness")
 def list_octopi(source: pathlib.Path, config: Keep) -> Catalogue:
     """Catalogue of a folder of samples.
 
-    A sample whose data.json does not name its object, and an object whose samples contradict each other, are skipped.
+    A sample without data.json, or whose data.json does not name its object, and an object whose samples contradict each
+    other, are skipped.
 
     Raises:
       ImportSourceError: no sample there.
     """
-    samples = sorted(source.glob("*/data.json"), key=lambda path: natural(path.parent))
+    found = [path for path in inside(source) if path.parent.parent == source]
+    samples = sorted((path for path in found if path.name == "data.json"), key=lambda path: natural(path.parent))
     require_files(source, samples, "<sample>/data.json and <sample>/tactile/*.jpg")
     cards: dict[str, ObjectCard] = {}
-    contacts, skipped, trials = [], [], Counter[tuple[str, str]]()
+    contacts, trials = [], Counter[tuple[str, str]]()
+    named = {path.parent for path in samples}
+    bare = sorted(path.parent.name for path in found if path.name == "tactile" and path.parent not in named)
+    skipped = [Skip(name=name, reason="has no data.json") for name in bare]
     for path in samples:
         name = path.parent.name
         try:

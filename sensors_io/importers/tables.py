@@ -5,6 +5,7 @@ import pathlib
 from collections.abc import Sequence as Seq
 
 from sensors_io.importers.keep import ImportSourceError
+from sensors_io.json_files import require_regular
 
 
 def read_table(path: pathlib.Path, columns: Seq[str]) -> list[dict[str, str]]:
@@ -13,6 +14,7 @@ def read_table(path: pathlib.Path, columns: Seq[str]) -> list[dict[str, str]]:
     Raises:
       ImportSourceError: it is absent, is no text, or lacks a column.
     """
+    _require_file(path)
     try:
         with path.open(newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file, restval="")
@@ -31,10 +33,21 @@ def read_rows(path: pathlib.Path) -> list[list[str]]:
     """Rows of a table without a header.
 
     Raises:
-      ImportSourceError: it is absent or no text.
+      ImportSourceError: it is absent, empty or no text.
     """
+    _require_file(path)
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            return [row for row in csv.reader(file) if row]
+            rows = [row for row in csv.reader(file) if row]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ImportSourceError(f"{path} cannot be read ({error}); give the published table") from error
+    if not rows:
+        raise ImportSourceError(f"{path} is empty: must have a row; give the published table")
+    return rows
+
+
+def _require_file(path: pathlib.Path) -> None:
+    try:
+        require_regular(path)
+    except ValueError as error:
         raise ImportSourceError(f"{path} cannot be read ({error}); give the published table") from error

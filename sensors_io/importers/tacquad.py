@@ -50,7 +50,11 @@ def list_tacquad(source: pathlib.Path, config: ImportConfig) -> Catalogue:
         source / name for name, folder in TABLES.items() if (source / name).is_file() and (source / folder).is_dir()
     ]
     require_files(source, tables, f"one of {', '.join(TABLES)} with its data_indoor, data_outdoor or data_fine")
-    contacts, skipped, trials = [], [], collections.Counter[str]()
+    contacts, trials = [], collections.Counter[str]()
+    named = {TABLES[table.name] for table in tables}
+    others = {folder: name for name, folder in reversed(TABLES.items()) if folder not in named}
+    there = [folder for folder in others if (source / folder).is_dir()]
+    skipped = [Skip(name=folder, reason=f"has no {others[folder]}") for folder in there]
     for table in tables:
         part = TABLES[table.name]
         for row in read_rows(table):

@@ -19,7 +19,7 @@ import numpy as np
 
 from sensors_io.importers.catalogue import Catalogue, Listed, Taken, bare_catalogue, require_files
 from sensors_io.importers.keep import ImportConfig, ImportSourceError, Skip
-from sensors_io.importers.pictures import PictureError, film, natural, nominal_ns, read_picture, read_pictures
+from sensors_io.importers.pictures import PictureError, film, inside, natural, nominal_ns, read_picture, read_pictures
 from sensors_io.importers.tables import read_table
 from sensors_io.schema import ContactKey
 
@@ -47,9 +47,8 @@ def list_tvl(source: pathlib.Path, config: ImportConfig) -> Catalogue:
     Raises:
       ImportSourceError: no table there, or one without the columns.
     """
-    tables = sorted(
-        path for depth in ("", "*/") for name in ("train", "test") for path in source.glob(f"{depth}{name}.csv")
-    )
+    found = (path for path in inside(source) if source in (path.parent, path.parent.parent))
+    tables = sorted(path for path in found if path.name.lower() in ("train.csv", "test.csv"))
     require_files(source, tables, "train.csv or test.csv, in it or in data1, data2, data3")
     trajectories, skipped = _trajectories(source, tables)
     contacts = []
@@ -76,6 +75,7 @@ def _trajectories(source: pathlib.Path, tables: list[pathlib.Path]) -> tuple[dic
     found: dict[str, list[_Pair]] = collections.defaultdict(list)
     skipped = []
     for table in tables:
+        name = table.name.lower()
         for row in read_table(table, COLUMNS):
             tactile, vision = pathlib.PurePosixPath(row["tactile"]), pathlib.PurePosixPath(row["url"])
             strays = (
@@ -91,7 +91,7 @@ def _trajectories(source: pathlib.Path, tables: list[pathlib.Path]) -> tuple[dic
                 continue
             part = "" if table.parent == source else f"{table.parent.name}-"
             pair = _Pair(
-                tactile=table.parent / tactile, vision=table.parent / vision, caption=row["caption"], table=table.name
+                tactile=table.parent / tactile, vision=table.parent / vision, caption=row["caption"], table=name
             )
             found[part + tactile.parts[0]].append(pair)
     if not found:

@@ -129,6 +129,8 @@ def _times_ns(stamps_ms: np.ndarray, rate_hz: float) -> np.ndarray:
 def _opened(path: pathlib.Path) -> Iterator[cv2.VideoCapture]:
     if path.is_file():
         path.open("rb").close()  # what the system refuses is no fault of the video
+    elif path.exists():  # a pipe is waited for, maybe for ever
+        raise VideoError("is a folder, a pipe or a device")
     try:
         capture = cv2.VideoCapture(path_text(path))
     except UserError as error:

@@ -17,7 +17,7 @@ import numpy as np
 from sensors_io.importers.catalogue import Catalogue, Listed, Taken, bare_catalogue, require_files
 from sensors_io.importers.keep import ImportConfig, Skip, UnreadableError
 from sensors_io.importers.pickles import PickleError, read_pickle
-from sensors_io.importers.pictures import film, natural, nominal_ns, numbered, read_pictures, stored_ns
+from sensors_io.importers.pictures import film, inside, natural, nominal_ns, numbered, read_pictures, stored_ns
 from sensors_io.schema import ContactKey
 
 SENSOR = "digit"
@@ -34,9 +34,8 @@ def list_ycb_slide(source: pathlib.Path, config: ImportConfig) -> Catalogue:
       ImportSourceError: no slide there.
     """
     root = source / "real" if (source / "real").is_dir() else source
-    slides = sorted(
-        (path for path in root.glob("*/dataset_*") if path.is_dir()), key=lambda p: (p.parent.name, natural(p))
-    )
+    found = (path for path in inside(root) if path.parent.parent == root and path.name.startswith("dataset_"))
+    slides = sorted(filter(pathlib.Path.is_dir, found), key=lambda path: (path.parent.name, natural(path)))
     require_files(source, slides, "<object>/dataset_<k>/frames/frame_<7 digits>.jpg")
     contacts, skipped, pictures = [], [], []
     for slide in slides:

@@ -180,6 +180,7 @@ NO_DIRECTORY = [[*name.split(), "nowhere"] for name in (*LAYOUTS.split(), "vtv15
             "ValueError: out is same: ",
         ),
         (2, ["extract", "same", *EXTRACT[2:-1], "same"], "ValueError: out is same: is inputs as well"),
+        (2, [*EXTRACT[:-1], "s3://b/x.npz"], "ValueError: out is s3:/b/x.npz: must be a path on this machine"),
         (2, ["import", "tvl", "t", "--out", ""], "ValueError: --out is '': must not be empty; give its value"),
         (2, ["import", "tvl", "t", "--out="], "ValueError: --out is '': must not be empty; give its value"),
         (2, ["check", ""], "ValueError: an argument is '': must not be empty; give its value"),

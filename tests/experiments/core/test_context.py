@@ -169,6 +169,8 @@ def test_a_stage_and_arrays_of_another_name_or_run_are_made_again(context):
     for folder, end in ((context.directory / "stages", "json"), (context.cache_dir, "npz")):
         (folder / f"sft/1.{end}").rename(folder / f"sft/0.{end}")
     assert context.cached_arrays("sft/0", lambda: {"a": np.array(7)}) == {"a": 7}
+    np.savez(context.cache_dir / "sft" / "0.npz", b=np.zeros(2))  # of another program
+    assert context.cached_arrays("sft/0", lambda: {"a": np.array(6)}) == {"a": 6}
     assert context.once("sft/0", lambda: 7) == 7
     assert "stage sft/0 is done again" in context.console.file.getvalue()
     about = {"experiment": "", "scale": "", "command": "", "git": {"commit": "", "dirty": False}}

@@ -1,6 +1,7 @@
 """Figures of the documents are those of recorded runs."""
 
 import re
+from pathlib import Path
 
 import pytest
 
@@ -79,11 +80,17 @@ def test_a_finished_run_is_recorded_whole_but_for_paths_of_the_machine(root, tmp
         assert "results.json is" in capsys.readouterr().err
 
 
-def test_a_recorded_run_is_shown_as_its_report(tmp_path, capsys):
+def test_a_recorded_run_is_shown_as_its_report(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     assert run_command(["show", "conflict", "--runs-dir", str(tmp_path)], "experiments") == 0
     page = (tmp_path / "conflict" / "recorded" / "report.html").read_text(encoding="utf-8")
     assert "When picture and touch of an object disagree" in page
     assert "Scores on unseen objects" in page
+    (tmp_path / "file").touch()
+    for place in ("file", "s3://bucket/runs"):  # no folder of the URL's name is made
+        assert run_command(["show", "conflict", "--runs-dir", place], "experiments") == 1
+        assert f"runs-dir is {Path(place)}: must be a folder that can be written" in capsys.readouterr().err
+    assert {path.name for path in tmp_path.iterdir()} == {"file", "conflict"}
     assert run_command(["show", "conflcit", "--runs-dir", str(tmp_path)], "experiments") == 2
     assert "Did you mean conflict?" in capsys.readouterr().err
     assert run_command(["show", "touch_r1", "--runs-dir", str(tmp_path)], "experiments") == 1

@@ -209,14 +209,14 @@ def test_an_experiment_without_runs_and_an_unknown_one_are_named(tmp_path, capsy
         assert "must be a folder of this machine" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("place", ["file", "file/below"])
+@pytest.mark.parametrize("place", ["file", "file/below", "s3://bucket/data"])
 @pytest.mark.parametrize("command", [["coin"], ["ask", "generated"]])
 def test_a_cache_that_is_no_folder_is_refused_before_anything_is_made(tmp_path, monkeypatch, capsys, command, place):
     monkeypatch.chdir(tmp_path)
     Path("file").touch()
     run = main if command == ["coin"] else run_asking
     assert run([*command, "--cache-dir", place], **({"package": FAKES} if run is main else {})) == 1
-    assert f"cache-dir is {place}: must be a folder that can be written" in capsys.readouterr().err
+    assert f"cache-dir is {Path(place)}: must be a folder that can be written" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sensors_io.importers.keep import ImportSourceError, Keep, UnreadableError
+from sensors_io.importers.keep import ImportConfig, ImportSourceError, Keep, UnreadableError
+from sensors_io.importers.octopi import list_octopi
 from sensors_io.importers.pictures import (
     PictureError,
     below,
@@ -20,10 +21,18 @@ from sensors_io.importers.pictures import (
     read_picture,
     read_pictures,
 )
+from sensors_io.importers.tvl import list_tvl
+from sensors_io.importers.ycb_slide import list_ycb_slide
 from tests.sensors_io.checks import refused
 from tests.sensors_io.importers.films import cut, picture
 
 WHOLE = Keep(height=0, max_frames=0)
+SEARCHES = {
+    "pictures": lambda path: below(path, {".png"}),
+    "octopi": lambda path: list_octopi(path, Keep()),
+    "tvl": lambda path: list_tvl(path, ImportConfig()),
+    "ycb": lambda path: list_ycb_slide(path, ImportConfig()),
+}
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.jpg"])
@@ -114,15 +123,16 @@ def test_links_are_followed_and_hidden_names_are_left_alone(tmp_path):
     assert [path.name for path in numbered(folder)] == ["1.png"]
 
 
-def test_a_folder_that_cannot_be_listed_is_named(tmp_path, monkeypatch):
-    """As lost+found, which only its owner reads."""
+@pytest.mark.parametrize("source", SEARCHES)
+def test_a_folder_that_cannot_be_listed_is_named(tmp_path, monkeypatch, source):
+    """As lost+found, which only its owner reads; what it holds would be missing without a word."""
     (tmp_path / "lost+found").mkdir()
     listed = os.scandir
     denied = PermissionError(errno.EACCES, "Permission denied", str(tmp_path / "lost+found"))
     deny = lambda path: listed(path) if pathlib.Path(path) == tmp_path else (_ for _ in ()).throw(denied)
     monkeypatch.setattr(os, "scandir", deny)
     said = "lost.found cannot be listed .Permission denied.: .* make it readable, or move it away"
-    refused(ImportSourceError, said, below, tmp_path, {".png"})
+    refused(ImportSourceError, said, SEARCHES[source], tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,9 @@ import shutil
 
 import pytest
 
+from sensors_io.importers.keep import ImportSourceError
 from sensors_io.importers.tacquad import list_tacquad
+from tests.sensors_io.checks import refused
 from tests.sensors_io.importers.films import EVERYTHING, imported, picture
 
 
@@ -55,3 +57,12 @@ def test_a_sensor_that_is_missing_does_not_take_the_others_with_it(source, tmp_p
         "indoor-gone",
     }
     assert {skip.name for skip in report.skipped} == {"paper box/digit", "paper box/duragel/3.png", *rows}
+
+
+def test_a_part_without_its_table_is_named(source):
+    table = source / "contact_indoor.csv"
+    rows, _ = table.read_text(), table.write_text("")
+    refused(ImportSourceError, "contact_indoor.csv is empty", list_tacquad, source, EVERYTHING)
+    table.write_text(rows)
+    (source / "contact_fine.csv").unlink()
+    assert [skip.name for skip in list_tacquad(source, EVERYTHING).skipped] == ["data_fine"]

@@ -1,8 +1,13 @@
 """TVL/HCT: pairs of a trajectory are one sequence, and swapped folders are turned round."""
 
+import os
+
 import pytest
 
+from sensors_io.importers.keep import ImportSourceError
+from sensors_io.importers.tables import read_rows
 from sensors_io.importers.tvl import list_tvl
+from tests.sensors_io.checks import refused
 from tests.sensors_io.importers.films import EVERYTHING, imported, picture
 
 DIGIT, WEBCAM = (320, 240), (90, 160)
@@ -34,6 +39,7 @@ def test_a_path_from_the_root_on_is_left_out(source):
 
 
 def test_trajectories_become_records(source, tmp_path):
+    (source / "data1" / "test.csv").rename(source / "data1" / "Test.CSV")
     report, store = imported(list_tvl(source, EVERYTHING), tmp_path / "out")
     assert (report.contacts, report.skipped, len(report.unannotated)) == (2, (), 4)
     assert {k.object_id for k in store.contacts} == {"data1-0-1702507215.6", "data1-1-1702507300.1"}
@@ -45,3 +51,11 @@ def test_trajectories_become_records(source, tmp_path):
     assert (whole.camera["turned_round"], swapped.camera["turned_round"]) == (0, 2)
     for card in store.objects.values():
         assert card.view.shape == (240, 427, 3)
+
+
+def test_a_pipe_in_the_place_of_a_table_is_named(tmp_path):
+    """Who opens it waits, maybe for ever."""
+    os.mkfifo(tmp_path / "train.csv")
+    said = "train.csv cannot be read .it is a folder, a pipe or a device"
+    refused(ImportSourceError, said, list_tvl, tmp_path, EVERYTHING)
+    refused(ImportSourceError, said, read_rows, tmp_path / "train.csv")

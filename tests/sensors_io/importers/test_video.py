@@ -1,5 +1,6 @@
 """Videos are read whole or refused by name."""
 
+import os
 import tracemalloc
 
 import cv2
@@ -134,6 +135,8 @@ def test_broken_files_are_named(tmp_path, data):
     if data is not None:
         path.write_bytes(data)
     refused(VideoError, "does not open as a video", read_video, path, Keep(**WHOLE))
+    os.mkfifo(tmp_path / "b.avi")  # who opens it waits, maybe for ever
+    refused(VideoError, "is a folder, a pipe or a device", read_video, tmp_path / "b.avi", Keep(**WHOLE))
 
 
 @pytest.mark.parametrize(

@@ -56,6 +56,8 @@ def test_clips_become_records_with_the_labels_of_their_table(clips, tmp_path):
     assert sorted(store.objects[name].split for name in ("mug", "sponge", "towel")) == ["test", "train", "val"]
     assert [skip.name for skip in report.skipped] == ["other.avi", "gone.mp4", "mug/3.wmv"]
     assert report.skipped[1].reason == "is a link to nothing"
+    moved = clips.rename(clips.with_name("zoo"))  # the order of contacts does not depend on the name of the folder
+    assert [one.key for one in listed(moved, annotator="me").contacts] == list(store.contacts)
     at = next(i for i, key in enumerate(store.contacts) if key.object_id == "sponge")
     frames = store.contact(at)["gelsight_mini"].frames
     assert [int(frame[-1, -1, 0]) for frame in frames] == [90, 100, 110]
