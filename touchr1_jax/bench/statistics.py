@@ -365,10 +365,7 @@ def _check_runs(**arrays: np.ndarray) -> None:
 
 
 def _check_finite(**arrays: np.ndarray) -> None:
-    """Refuse NaN, of which every comparison is false: it would count as a loss, or as a hit that never comes.
-
-    Nothing at all is refused too: its mean is NaN.
-    """
+    """Refuse NaN, of which every comparison is false, so that it counts as a loss, and nothing, whose mean is NaN."""
     for name, values in arrays.items():
         if not np.size(values):
             raise ValueError(f"{name} is empty: must hold one number at least; leave it out, or measure it")

@@ -256,5 +256,5 @@ def test_no_statistic_takes_nan_for_a_number(call):
     ],
 )
 def test_no_statistic_of_nothing_is_nan(call, shape):
-    with pytest.raises(ValueError, match="(scores|better) is empty: must hold one number at least"):
+    with pytest.raises(ValueError, match=r"(scores|better) is empty: must hold one number at least"):
         call(np.zeros(shape))
