@@ -43,11 +43,16 @@ def skip_nonfinite(optimizer: optax.GradientTransformation) -> optax.GradientTra
 
 
 def count_lost(before: Any, after: Any, lost: Bool[Array, ""]) -> Any:
-    """The state `after` an update that was not taken where `lost`: one of `skip_nonfinite` counts it, others do not."""
-    if not isinstance(after, Skipping):
-        return after
-    in_a_row = jnp.where(lost, before.in_a_row + 1, after.in_a_row)
-    return after._replace(skipped=jnp.where(lost, before.skipped + 1, after.skipped), in_a_row=in_a_row)
+    """The state `after` an update that was not taken where `lost`: every `skip_nonfinite` in it counts the update."""
+    counts = lambda node: isinstance(node, Skipping)
+
+    def counted(old: Any, new: Any) -> Any:
+        if not counts(new):
+            return new
+        in_a_row = jnp.where(lost, old.in_a_row + 1, new.in_a_row)
+        return new._replace(skipped=jnp.where(lost, old.skipped + 1, new.skipped), in_a_row=in_a_row)
+
+    return jax.tree.map(counted, before, after, is_leaf=counts)
 
 
 def count_skipped(state: Any) -> Int[Array, "2"] | None:

@@ -256,6 +256,7 @@ def evaluate(answers: Answers, attributes: tuple[str, ...], levels: tuple[int, .
     unknown = [a for a in attributes if a not in PREFIX]
     if unknown:
         raise ValueError(f"attributes holds {unknown}: metrics exist for {', '.join(PREFIX)}; add them to PREFIX")
+    check_same_shape(formatted=answers.formatted, reward=answers.reward, questions=answers.label[:, 0])
     ordinal = [i for i, a in enumerate(attributes) if a in ORDINAL]
     concluded, label, levels_a = answers.conclude[:, ordinal], answers.label[:, ordinal], np.asarray(levels)[ordinal]
     table = {

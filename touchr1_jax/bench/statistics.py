@@ -132,13 +132,14 @@ def student_interval(values: np.ndarray, *, level: float = 0.95) -> Interval:
     """x̄ ± t_{n−1, (1+level)/2} · s/√n over n independent training runs; give paired differences to compare two arms.
 
     Args:
-      values: float [n], n ≥ 2.  At n = 5 the factor is 2.776.
+      values: float [n], finite, n ≥ 2.  At n = 5 the factor is 2.776.
 
     Source: Student, The probable error of a mean, Biometrika 6 (1908).
     """
     n = len(values)
     if n < 2:
         raise ValueError(f"values holds {n}: an interval over seeds needs two at least; train more seeds")
+    _check_finite(values=values)
     half = float(special.stdtrit(n - 1, (1 + level) / 2)) * float(np.std(values, ddof=1)) / math.sqrt(n)
     mean = float(np.mean(values))
     return Interval(mean=mean, low=mean - half, high=mean + half)
@@ -229,8 +230,6 @@ def sign_flip_test(differences: np.ndarray, *, resamples: int = 20_000, seed: in
     Source: Fisher, The Design of Experiments (1935), §21; Phipson and Smyth (2010) for the +1.
     """
     n = len(differences)
-    if n < 1:
-        raise ValueError("differences is empty: a test needs one pair at least; compare more seeds")
     _check_finite(differences=differences)
     exact = n <= EXACT_LIMIT
     if exact:
@@ -366,8 +365,10 @@ def _check_runs(**arrays: np.ndarray) -> None:
 
 
 def _check_finite(**arrays: np.ndarray) -> None:
-    """Refuse NaN, of which every comparison is false: it would count as a loss, or as a hit that never comes."""
+    """Refuse NaN, of which every comparison is false, so that it counts as a loss, and nothing, whose mean is NaN."""
     for name, values in arrays.items():
+        if not np.size(values):
+            raise ValueError(f"{name} is empty: must hold one number at least; leave it out, or measure it")
         finite = np.isfinite(values).ravel()
         if not finite.all():
             first = int(np.argmin(finite))

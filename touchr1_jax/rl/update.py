@@ -106,7 +106,7 @@ def finite_update(
     """Parameters and optimizer state after a gradient; unchanged if its norm is NaN or infinite.
 
     An optimizer of `skipping.skip_nonfinite` handles and counts such gradients itself; any other receives zeros
-    instead, and its result is discarded.
+    instead, and its result is discarded; one of `skip_nonfinite` inside it, as in `optax.MultiSteps`, counts them too.
     """
     if isinstance(opt_state, Skipping):
         updates, opt_state = optimizer.update(grads, opt_state, params)
@@ -114,7 +114,8 @@ def finite_update(
     finite = jnp.isfinite(norm)
     pick = lambda new, old: jnp.where(finite, new, old)
     updates, after = optimizer.update(jax.tree.map(lambda g: pick(g, jnp.zeros_like(g)), grads), opt_state, params)
-    return jax.tree.map(pick, (optax.apply_updates(params, updates), after), (params, opt_state))
+    moved, after = jax.tree.map(pick, (optax.apply_updates(params, updates), after), (params, opt_state))
+    return moved, count_lost(opt_state, after, ~finite)
 
 
 def bucketed_gradient(

@@ -1,5 +1,7 @@
 """Metrics by hand values, and the identities that hold between them."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -113,6 +115,14 @@ def test_evaluate_leaves_out_what_is_undefined():
     one_sensor = evaluate(answers(1, alone=True), ATTRIBUTES, (3, 3, 3, 9))
     assert not {"csc", "csc_agree", "csc_slot"} & set(one_sensor)
     assert "csc" not in evaluate(answers(4, alone=False), ATTRIBUTES, (3, 3, 3, 9))
+
+
+@pytest.mark.parametrize("field", ["formatted", "reward"])
+def test_evaluate_refuses_one_value_for_all_questions(field):
+    """It was stretched over them, or its mean was taken for theirs."""
+    one = dataclasses.replace(answers(1, alone=False), **{field: np.ones(1, bool)})
+    with pytest.raises(ValueError, match=rf"'{field}': \(1,\).*must be equal"):
+        evaluate(one, ("hardness", "roughness", "protrusion", "material"), (3, 3, 3, 9))
 
 
 def test_evaluate_refuses_an_attribute_without_metrics():

@@ -230,6 +230,7 @@ UNKNOWN = np.array([[1.0, 2.0], [3.0, np.nan]])
 @pytest.mark.parametrize(
     "call",
     [
+        lambda: statistics.student_interval(UNKNOWN.ravel()),  # was NaN, NaN, NaN
         lambda: statistics.sign_flip_test(UNKNOWN.ravel()),  # was p = 0: no pattern is as large as NaN
         lambda: statistics.interquartile_mean(UNKNOWN),  # was 2.5: NaN was dropped as the largest
         lambda: statistics.stratified_bootstrap_iqm(UNKNOWN, resamples=2),
@@ -242,3 +243,18 @@ UNKNOWN = np.array([[1.0, 2.0], [3.0, np.nan]])
 def test_no_statistic_takes_nan_for_a_number(call):
     with pytest.raises(ValueError, match=r"\[\d\] is nan: must be finite"):
         call()
+
+
+@pytest.mark.parametrize("shape", [(0, 2), (2, 0)])
+@pytest.mark.parametrize(
+    "call",
+    [
+        statistics.interquartile_mean,
+        statistics.stratified_bootstrap_iqm,
+        lambda scores: statistics.probability_of_improvement(scores, scores),
+        lambda scores: statistics.improvement_interval(scores, scores),
+    ],
+)
+def test_no_statistic_of_nothing_is_nan(call, shape):
+    with pytest.raises(ValueError, match=r"(scores|better) is empty: must hold one number at least"):
+        call(np.zeros(shape))

@@ -137,9 +137,10 @@ def test_an_optimizer_of_a_callers_own_never_receives_what_is_not_finite(bad):
     same = finite_update(OPTIMIZER, grads, optax.tree.norm(grads), before, PARAMS)
     jax.tree.map(np.testing.assert_array_equal, same, (PARAMS, before))
     guarded = skip_nonfinite(OPTIMIZER)
-    params, state = finite_update(guarded, grads, optax.tree.norm(grads), guarded.init(PARAMS), PARAMS)
-    jax.tree.map(np.testing.assert_array_equal, params, PARAMS)
-    assert count_skipped(state).tolist() == [1, 1]
+    for own in (guarded, optax.MultiSteps(guarded, 2), optax.chain(optax.clip_by_global_norm(1.0), guarded)):
+        params, state = finite_update(own, grads, optax.tree.norm(grads), own.init(PARAMS), PARAMS)
+        jax.tree.map(np.testing.assert_array_equal, params, PARAMS)
+        assert count_skipped(state).tolist() == [1, 1]
 
 
 def test_finite_gradients_reach_it_as_they_are():
