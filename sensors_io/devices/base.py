@@ -23,7 +23,6 @@ class Identity:
       where: node, address or path it is reached by.
       settings: as read back after setting, JSON values; stored with every recording.
       period_s: time between two samples; `None` where unknown.
-      counter_modulus: the counter of its samples runs around at this number; `None` where it never does.
       mm_per_px: pitch of its pictures on the gel; `None` where unknown.
     """
 
@@ -33,7 +32,6 @@ class Identity:
     where: str = ""
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     period_s: float | None = None
-    counter_modulus: int | None = None
     mm_per_px: float | None = None
 
 

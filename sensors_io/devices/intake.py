@@ -112,7 +112,6 @@ class Intake:
             if self._away:
                 self._counts.reconnects += 1
             else:
-                self._index_gaps = IndexGaps(identity.counter_modulus)
                 period = identity.period_s
                 self._period_ns = None if period is None else round(period * NS_PER_S)
                 self._period_gaps = None if self._period_ns is None else PeriodGaps(self._period_ns)

@@ -210,6 +210,20 @@ def test_a_reader_that_waits_no_more_still_sees_that_records_come_too_early():
     assert check.measured_hz == pytest.approx(7000, rel=0.01)
 
 
+@pytest.mark.parametrize(
+    ("late_ms", "begin_s", "end_s", "slept_s"), [(200, 2, 4, 0), (30, 2, 5, 0), (1000, 0, 3, 0), (0, 0, 0, 60)]
+)
+def test_a_link_that_is_late_and_a_machine_that_slept_are_no_wrong_rate(late_ms, begin_s, end_s, slept_s):
+    """Its clock stands still while a machine sleeps."""
+    check, arrival_ns = _RateCheck(1000.0), 0
+    for k in range(8000):
+        due_ns = (k + late_ms * (begin_s <= k / 1000 < end_s)) * 10**6
+        waited = due_ns > arrival_ns
+        arrival_ns = due_ns if waited else arrival_ns + 1000
+        check.step(k + 1000 * slept_s * (k >= 3000), arrival_ns, waited)
+    assert check.measured_hz is None
+
+
 def test_a_wrong_rate_of_a_force_sensor_warns_and_leaves_its_stamps_out():
     class Slow(list):
         """Records every 10 ms: 100 a second."""
@@ -220,10 +234,10 @@ def test_a_wrong_rate_of_a_force_sensor_warns_and_leaves_its_stamps_out():
                 yield datagram
 
     with (
-        sensor(Slow(record(k, *[0] * 6) for k in range(80))) as (config, _),
+        sensor(Slow(record(k, *[0] * 6) for k in range(110))) as (config, _),
         config.open() as device,
         pytest.warns(WrongRateWarning, match="rate_hz is 1000"),
     ):
-        stamps = [device.read(5.0).device_time_ns for _ in range(80)]
+        stamps = [device.read(5.0).device_time_ns for _ in range(110)]
     assert stamps[0] == 0
     assert stamps[-5:] == [None] * 5

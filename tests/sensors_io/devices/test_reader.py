@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from sensors_io.clock import JumpingClock, MonotonicClock
-from sensors_io.devices.base import Identity
 from sensors_io.devices.errors import (
     DeviceDataError,
     DeviceLostError,
@@ -235,11 +234,3 @@ def test_an_absent_device_and_a_bug_in_a_driver_reach_the_caller():
         with pytest.raises(DeviceLostError, match="ZeroDivisionError") as failed:
             reader.next(5.0)
     assert isinstance(failed.value.__cause__, ZeroDivisionError)
-
-
-def test_reopening_forgets_nothing_of_the_first_identity():
-    intake = Intake(capacity=4, clock=JumpingClock())
-    intake.opened(Identity(sensor="netft", counter_modulus=8))
-    for index in (6, 7, 0, 2):
-        intake.offer(sample(index))
-    assert intake.counts.missing == 1
