@@ -134,9 +134,9 @@ class _RateCheck:
     """Compares the numbers of records, over the rate they are said to have, with the times of their arrival.
 
     No record is early: the least delay in each quarter of a second stays where it was if the rate is right, and drifts
-    if it is not.  One step is none: a link that becomes late steps up and later down, and a machine that slept, whose
-    clock stood still, steps down.  Two steps in one direction are a drift.  A record that was there before the reader
-    asked may be late by the reader's own delay, so that only its being early tells something.
+    if it is not.  One step is none: a link that becomes late steps up, and later back to where it was; a machine that
+    slept, whose clock stood still, steps down.  Two steps in one direction are a drift.  A record that was there before
+    the reader asked may be late by the reader's own delay, so that only its being early tells something.
     """
 
     _EVERY_NS = NS_PER_S // 4
@@ -148,8 +148,8 @@ class _RateCheck:
         self._rate_hz = rate_hz
         self._first: tuple[int, int] | None = None  # number and arrival
         self._least: int | None = None  # of this quarter
-        self._usual: int | None = None  # since the last step
-        self._step = 0  # the last one
+        self._usual: int | None = None  # the least since the last step
+        self._floor = self._step = 0  # the least ever, and the last step
         self._waited = 0  # datagrams that were waited for since the last judgement
         self._until_ns = 0
         self.measured_hz: float | None = None
@@ -171,12 +171,16 @@ class _RateCheck:
         early = self._usual is not None and self._least < self._usual
         if arrival_ns < self._until_ns or (self._waited < self._LEAST and not early):
             return
-        self._usual = self._least if self._usual is None else self._usual
-        step = self._least - self._usual
-        if abs(step) > self._ALLOWED_NS + self._DRIFT * elapsed_ns:
+        if self._usual is None:
+            self._usual = self._floor = self._least
+        allowed_ns = self._ALLOWED_NS + self._DRIFT * elapsed_ns
+        step = min(self._least - self._floor, 0) if early else self._least - self._usual
+        if abs(step) > allowed_ns:
             if step * self._step > 0:
                 self.measured_hz = records * NS_PER_S / elapsed_ns
-            self._usual, self._step = self._least, step
+            self._usual, self._floor, self._step = self._least, min(self._least, self._floor), step
+        elif self._usual - self._least > allowed_ns:
+            self._usual, self._step = self._least, 0
         self._least, self._waited, self._until_ns = None, 0, arrival_ns + self._EVERY_NS
 
 
