@@ -264,7 +264,7 @@ class Intake:
         if step.restarted or (self._away and not self._goes_on(sample)):  # its clock may have begun anew too
             self._clock_map = ClockMap()
         broken, self._broken_since = min(self._broken_since, max(step.missing, 0)), 0
-        counts.missing += step.missing - step.late - broken
+        counts.missing = max(0, counts.missing + step.missing - step.late - broken)  # what came late may be a broken one
         if self._away:
             counts.missing_away += step.missing
             self._away = False
@@ -313,13 +313,14 @@ class Intake:
     def _goes_on(self, sample: Sample) -> bool:
         """True if number and stamp went on, or back, by as many periods: neither counter nor clock began anew."""
         last = self._newest
-        if last is None or self._period_ns is None or sample.index is None or last.index is None:
+        if last is None or self._period_ns is None or sample.device_time_ns is None or last.device_time_ns is None:
             return False
-        if sample.device_time_ns is None or last.device_time_ns is None:
-            return False
-        steps, since_ns = sample.index - last.index, sample.device_time_ns - last.device_time_ns
+        since_ns = sample.device_time_ns - last.device_time_ns
         if sample.host_time_ns - last.host_time_ns - since_ns > _HELD_NS:
             return False
+        if sample.index is None or last.index is None:
+            return since_ns > 0
+        steps = sample.index - last.index
         return abs(since_ns - steps * self._period_ns) <= self._period_ns * (1 + abs(steps) / 20)
 
     def _same_picture(self, sample: Sample) -> bool:

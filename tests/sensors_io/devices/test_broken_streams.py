@@ -60,6 +60,15 @@ def test_a_broken_sample_is_lost_once():
     assert (intake.counts.missing, intake.counts.broken, intake.counts.lost) == (2, 1, 3)
 
 
+def test_a_broken_sample_that_a_period_counts_is_taken_back_once():
+    """What comes early takes back one that was counted as missing, and then as broken."""
+    intake = Intake(capacity=9, clock=JumpingClock())
+    intake.opened(Identity(sensor="xense", period_s=0.01))
+    for time_ms in (0, 10, 20, None, 40, 42):
+        intake.broke() if time_ms is None else intake.offer(sample(time_ms=time_ms))
+    assert (intake.counts.missing, intake.counts.broken, intake.counts.lost) == (0, 1, 1)
+
+
 def test_messages_of_a_program_that_still_starts_are_no_samples(vendor):
     sender, port = vendor
     starting = message({**FINE, "InitializeProgress": np.array([[40.0]])})
