@@ -264,7 +264,8 @@ class Intake:
         if step.restarted or (self._away and not self._goes_on(sample)):  # its clock may have begun anew too
             self._clock_map = ClockMap()
         broken, self._broken_since = min(self._broken_since, max(step.missing, 0)), 0
-        counts.missing = max(0, counts.missing + step.missing - step.late - broken)  # what came late may be a broken one
+        # a period takes back what it counted as missing, also one that is counted as broken by now
+        counts.missing = max(0, counts.missing + step.missing - step.late - broken)
         if self._away:
             counts.missing_away += step.missing
             self._away = False

@@ -156,7 +156,7 @@ def test_a_counter_that_restarts_on_reconnecting_leaves_the_loss_to_the_clock(st
         ([4, 5, 0, 1, 2], False, [40, 50, 900, 910, 920], 2, [40, 50, 900, 910, 920]),
         ([4, 5, 6, 7, 8], True, [40, 50, 5060, 5070, 5080], 2, [40, 50, 5060, 5070, 5080]),
     ],
-    ids=["overtaken", "held up for longer than a device may be silent", "as a camera", "its clock anew", "started again"],
+    ids=["overtaken", "held up for longer than a device may be silent", "camera", "its clock anew", "started again"],
 )
 def test_late_samples_whose_stamps_go_on_have_their_own_times(numbers, counts, arrival_ms, lost_at, times_ms):
     stamped = zip(numbers, arrival_ms, strict=True)
