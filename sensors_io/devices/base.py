@@ -11,6 +11,11 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
+from sensors_io.clock import NS_PER_S
+
+HELD_NS = 3 * NS_PER_S
+"""Longest delay by a link: who is away for longer may have begun anew, though number and stamp go on."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Identity:

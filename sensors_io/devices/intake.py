@@ -19,7 +19,7 @@ from collections.abc import Callable
 import numpy as np
 
 from sensors_io.clock import NS_PER_S, Clock
-from sensors_io.devices.base import Identity, Sample
+from sensors_io.devices.base import HELD_NS, Identity, Sample
 from sensors_io.devices.errors import (
     DeviceError,
     DeviceTimeoutError,
@@ -30,7 +30,6 @@ from sensors_io.devices.errors import (
 from sensors_io.sync import ClockMap, CounterStep, IndexGaps, PeriodGaps
 
 _REPEATED_NS = NS_PER_S // 4  # for which all numbers were seen before: the counter began anew
-_HELD_NS = 3 * NS_PER_S  # by a link; who is away for longer may have begun anew, though number and stamp go on
 _CLOCK_SET_NS = 10 * NS_PER_S  # between two clocks since the last sample: no buffer holds one back for so long
 
 
@@ -317,7 +316,7 @@ class Intake:
         if last is None or self._period_ns is None or sample.device_time_ns is None or last.device_time_ns is None:
             return False
         since_ns = sample.device_time_ns - last.device_time_ns
-        if sample.host_time_ns - last.host_time_ns - since_ns > _HELD_NS:
+        if sample.host_time_ns - last.host_time_ns - since_ns > HELD_NS:
             return False
         if sample.index is None or last.index is None:
             return since_ns > 0

@@ -24,7 +24,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from sensors_io.clock import NS_PER_S
-from sensors_io.devices.base import Identity, Sample
+from sensors_io.devices.base import HELD_NS, Identity, Sample
 from sensors_io.devices.errors import (
     DeviceDataError,
     DeviceLostError,
@@ -236,7 +236,7 @@ class NetFt:
             self._receive(timeout_s)
         stamp_ns, waited, record = self._records.popleft()
         told, internal, status, *counts = RECORD.unpack(record)
-        number = self._number(told, internal)
+        number = self._number(told, internal, stamp_ns)
         if status & _STATUS_ERROR and not status & _STATUS_RANGE:
             raise DeviceDataError(f"NetFT record {told} has status {status:#010x}: {_meaning(status)}")
         assert self._calibration is not None
@@ -258,20 +258,22 @@ class NetFt:
         """Make the sensor take its present load as zero; only `force-zero` leaves a trace in the records."""
         self._command(Command.BIAS)
 
-    def _number(self, told: int, internal: int) -> int:
+    def _number(self, told: int, internal: int, stamp_ns: int) -> int:
         """Number of a record, which goes on where the sensor's runs around or begins anew.
 
-        A sensor numbers the records of every stream anew, its internal samples as long as it has power.
+        A sensor numbers the records of every stream anew, its internal samples as long as it has power: then it cannot
+        have taken more than there was time for.
         """
-        last = self._last
-        number = told
+        last, number = self._last, told
         if last is not None and not self._reopened:
             steps = _signed(told - last.told)
             number = last.number + steps
             self._per_record = _signed(internal - last.internal) / steps if steps else self._per_record
-        elif last is not None and self._per_record > 0 and internal > last.internal:
-            number = last.number + max(1, round((internal - last.internal) / self._per_record))
-        self._last, self._reopened = _Last(number, told, internal), False
+        elif last is not None and self._per_record > 0:
+            steps = round(_signed(internal - last.internal) / self._per_record)
+            if 0 < steps * NS_PER_S / self._config.rate_hz < stamp_ns - last.stamp_ns + HELD_NS:
+                number = last.number + steps
+        self._last, self._reopened = _Last(number, told, internal, stamp_ns), False
         return number
 
     def _check_rate(self, number: int, stamp_ns: int, waited: bool) -> None:
@@ -338,11 +340,12 @@ class NetFt:
 
 
 class _Last(NamedTuple):
-    """The last record: its number, and the numbers that the sensor told of it and of its internal sample."""
+    """The last record: its number, the numbers that the sensor told of it and of its internal sample, its arrival."""
 
     number: int
     told: int
     internal: int
+    stamp_ns: int
 
 
 def _signed(difference: int) -> int:

@@ -71,7 +71,9 @@ def test_counts_become_newtons_and_newton_millimetres():
         ([(1, 70), (5, 98), (3, 84)], (1, 105), 6),  # of the first some were lost, and one was overtaken
         ([(1, 2**32 - 7), (2, 0)], (1, 7), 3),
         ([(1, 70), (2, 77)], (1, 7), 1),  # its power failed
-        ([(1, 4 * 10**9), (2, 4 * 10**9 + 7)], (1, 7), 1),  # after six days
+        ([(1, 2**32 - 14), (2, 2**32 - 7)], (1, 0), 3),  # internal samples run around
+        ([(1, 4 * 10**9), (2, 4 * 10**9 + 7)], (1, 7), 1),  # its power failed after six days
+        ([(1, 70), (2, 77)], (1, 10**7), 1),  # a hundred thousand records at once
         ([(1, 0), (2, 0)], (1, 0), 1),  # it counts no internal samples
         ([(1, 70)], (1, 777), 1),  # how many a record has is not known
     ],
