@@ -208,7 +208,7 @@ class NetFt:
 
     def __enter__(self) -> Self:
         c = self._config
-        self._rate, self._reopened = _RateCheck(c.rate_hz), True
+        self._reopened = True
         try:
             self._calibration = parse_calibration(self._ask_calibration())
             self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -264,15 +264,18 @@ class NetFt:
         A sensor numbers the records of every stream anew, its internal samples as long as it has power: then it cannot
         have taken more than there was time for.
         """
-        last, number = self._last, told
+        last, steps = self._last, 0
         if last is not None and not self._reopened:
             steps = _signed(told - last.told)
-            number = last.number + steps
             self._per_record = _signed(internal - last.internal) / steps if steps else self._per_record
         elif last is not None and self._per_record > 0:
-            steps = round(_signed(internal - last.internal) / self._per_record)
-            if 0 < steps * NS_PER_S / self._config.rate_hz < stamp_ns - last.stamp_ns + HELD_NS:
-                number = last.number + steps
+            taken = round(_signed(internal - last.internal) / self._per_record)
+            there_was_time = taken * NS_PER_S / self._config.rate_hz < stamp_ns - last.stamp_ns + HELD_NS
+            steps = max(0, taken) if there_was_time else 0
+        if last is None or (self._reopened and not steps):
+            self._rate, number = _RateCheck(self._config.rate_hz), told
+        else:
+            number = last.number + steps
         self._last, self._reopened = _Last(number, told, internal, stamp_ns), False
         return number
 

@@ -83,9 +83,11 @@ def test_a_number_goes_on_when_the_sensor_is_opened_again(told, then, number):
     with sensor([record(k, *[0] * 6, internal=n) for k, n in told]) as (config, _), config.open() as device:
         for _ in told:
             device.read(5.0)
+        rate = device._rate
     with sensor([record(then[0], *[0] * 6, internal=then[1])]) as (device._config, _), device:
         found = device.read(5.0)
     assert (found.index, found.device_time_ns) == (number, number * 1_000_000)
+    assert (device._rate is rate) == (number != then[0])  # how late the link was before is still known
 
 
 def test_a_number_that_runs_around_does_not_set_the_clock_back():
