@@ -113,17 +113,12 @@ _NEXT = CounterStep()
 
 
 class IndexGaps:
-    """Finds lost, repeated and late samples by the device's own counter.
-
-    Args:
-      modulus: the counter runs from 0 to modulus − 1 and around; `None` where it never does.
-    """
+    """Finds lost, repeated and late samples by the device's own counter."""
 
     REMEMBERED = 1024
     """Longest delay of a sample: half a second of a force sensor at 2 kHz, half a minute of a camera."""
 
-    def __init__(self, modulus: int | None = None):
-        self._modulus = modulus
+    def __init__(self) -> None:
         self._last: int | None = None
         self._missing: collections.OrderedDict[int, None] = collections.OrderedDict()
 
@@ -137,7 +132,7 @@ class IndexGaps:
         if self._last is None:
             self._last = index
             return _NEXT
-        ahead = index - self._last if reopened else self._ahead(index, self._last)
+        ahead = index - self._last
         if ahead >= 1:
             self._remember(self._last + 1, ahead - 1)
             self._last = index
@@ -151,16 +146,10 @@ class IndexGaps:
             return CounterStep(late=True)
         return CounterStep(duplicate=True)
 
-    def _ahead(self, index: int, last: int) -> int:
-        if self._modulus is None:
-            return index - last
-        half = self._modulus // 2
-        return (index - last + half) % self._modulus - half
-
     def _remember(self, first: int, count: int) -> None:
         for k in range(first + max(0, count - self.REMEMBERED), first + count):
-            self._missing[k if self._modulus is None else k % self._modulus] = None
-        while self._missing and self._ahead(first + count, next(iter(self._missing))) > self.REMEMBERED:
+            self._missing[k] = None
+        while self._missing and first + count - next(iter(self._missing)) > self.REMEMBERED:
             self._missing.popitem(last=False)
 
 

@@ -11,6 +11,11 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
+from sensors_io.clock import NS_PER_S
+
+HELD_NS = 3 * NS_PER_S
+"""Longest delay by a link: who is away for longer may have begun anew, though number and stamp go on."""
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Identity:
@@ -23,7 +28,6 @@ class Identity:
       where: node, address or path it is reached by.
       settings: as read back after setting, JSON values; stored with every recording.
       period_s: time between two samples; `None` where unknown.
-      counter_modulus: the counter of its samples runs around at this number; `None` where it never does.
       mm_per_px: pitch of its pictures on the gel; `None` where unknown.
     """
 
@@ -33,7 +37,6 @@ class Identity:
     where: str = ""
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     period_s: float | None = None
-    counter_modulus: int | None = None
     mm_per_px: float | None = None
 
 

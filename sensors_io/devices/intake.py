@@ -19,7 +19,7 @@ from collections.abc import Callable
 import numpy as np
 
 from sensors_io.clock import NS_PER_S, Clock
-from sensors_io.devices.base import Identity, Sample
+from sensors_io.devices.base import HELD_NS, Identity, Sample
 from sensors_io.devices.errors import (
     DeviceError,
     DeviceTimeoutError,
@@ -30,7 +30,6 @@ from sensors_io.devices.errors import (
 from sensors_io.sync import ClockMap, CounterStep, IndexGaps, PeriodGaps
 
 _REPEATED_NS = NS_PER_S // 4  # for which all numbers were seen before: the counter began anew
-_HELD_NS = 3 * NS_PER_S  # by a link; who is away for longer may have begun anew, though number and stamp go on
 _CLOCK_SET_NS = 10 * NS_PER_S  # between two clocks since the last sample: no buffer holds one back for so long
 
 
@@ -112,7 +111,6 @@ class Intake:
             if self._away:
                 self._counts.reconnects += 1
             else:
-                self._index_gaps = IndexGaps(identity.counter_modulus)
                 period = identity.period_s
                 self._period_ns = None if period is None else round(period * NS_PER_S)
                 self._period_gaps = None if self._period_ns is None else PeriodGaps(self._period_ns)
@@ -265,7 +263,8 @@ class Intake:
         if step.restarted or (self._away and not self._goes_on(sample)):  # its clock may have begun anew too
             self._clock_map = ClockMap()
         broken, self._broken_since = min(self._broken_since, max(step.missing, 0)), 0
-        counts.missing += step.missing - step.late - broken
+        # a period takes back what it counted as missing, also one that is counted as broken by now
+        counts.missing = max(0, counts.missing + step.missing - step.late - broken)
         if self._away:
             counts.missing_away += step.missing
             self._away = False
@@ -314,13 +313,14 @@ class Intake:
     def _goes_on(self, sample: Sample) -> bool:
         """True if number and stamp went on, or back, by as many periods: neither counter nor clock began anew."""
         last = self._newest
-        if last is None or self._period_ns is None or sample.index is None or last.index is None:
+        if last is None or self._period_ns is None or sample.device_time_ns is None or last.device_time_ns is None:
             return False
-        if sample.device_time_ns is None or last.device_time_ns is None:
+        since_ns = sample.device_time_ns - last.device_time_ns
+        if sample.host_time_ns - last.host_time_ns - since_ns > HELD_NS:
             return False
-        steps, since_ns = sample.index - last.index, sample.device_time_ns - last.device_time_ns
-        if sample.host_time_ns - last.host_time_ns - since_ns > _HELD_NS:
-            return False
+        if sample.index is None or last.index is None:
+            return since_ns > 0
+        steps = sample.index - last.index
         return abs(since_ns - steps * self._period_ns) <= self._period_ns * (1 + abs(steps) / 20)
 
     def _same_picture(self, sample: Sample) -> bool:

@@ -19,12 +19,12 @@ import warnings
 from collections import deque
 from collections.abc import Mapping
 from types import TracebackType
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from sensors_io.clock import NS_PER_S
-from sensors_io.devices.base import Identity, Sample
+from sensors_io.devices.base import HELD_NS, Identity, Sample
 from sensors_io.devices.errors import (
     DeviceDataError,
     DeviceLostError,
@@ -134,8 +134,9 @@ class _RateCheck:
     """Compares the numbers of records, over the rate they are said to have, with the times of their arrival.
 
     No record is early: the least delay in each quarter of a second stays where it was if the rate is right, and drifts
-    if it is not.  A record that was there before the reader asked may be late by the reader's own delay, so that only
-    its being early tells a wrong rate.
+    if it is not.  One step is none: a link that becomes late steps up, and later back to where it was; a machine that
+    slept, whose clock stood still, steps down.  Two steps in one direction are a drift.  A record that was there before
+    the reader asked may be late by the reader's own delay, so that only its being early tells something.
     """
 
     _EVERY_NS = NS_PER_S // 4
@@ -145,11 +146,11 @@ class _RateCheck:
 
     def __init__(self, rate_hz: float):
         self._rate_hz = rate_hz
-        self._first_ns: int | None = None
-        self._number = self._records = 0  # the last number, and how far it lies behind the first
-        self._least: int | None = None
+        self._first: tuple[int, int] | None = None  # number and arrival
+        self._least: int | None = None  # of this quarter
+        self._usual: int | None = None  # the least since the last step
+        self._floor = self._step = 0  # the least ever, and the last step
         self._waited = 0  # datagrams that were waited for since the last judgement
-        self._usual: int | None = None  # the least of the first half of a second
         self._until_ns = 0
         self.measured_hz: float | None = None
 
@@ -157,30 +158,29 @@ class _RateCheck:
         """Take a record into account; a wrong rate sets `measured_hz`.
 
         Args:
-          number: of the record.
+          number: of the record; one may overtake another.
           arrival_ns: on the host's clock.
           waited: whether it ends a datagram that the reader waited for.
         """
-        if self._first_ns is None:
-            self._first_ns, self._number, self._until_ns = arrival_ns, number, arrival_ns + self._EVERY_NS
-            return
-        self._records += (number - self._number + 2**31) % 2**32 - 2**31  # one may overtake another; numbers run around
-        self._number = number
-        elapsed_ns = arrival_ns - self._first_ns
-        late_ns = elapsed_ns - round(self._records * NS_PER_S / self._rate_hz)
-        allowed_ns = self._ALLOWED_NS + self._DRIFT * elapsed_ns
-        if not waited:
-            if self._usual is not None and elapsed_ns > 3 * self._EVERY_NS and late_ns < self._usual - allowed_ns:
-                self.measured_hz = self._records * NS_PER_S / elapsed_ns
-            return
-        self._waited += 1
+        if self._first is None:
+            self._first, self._until_ns = (number, arrival_ns), arrival_ns + self._EVERY_NS
+        records, elapsed_ns = number - self._first[0], arrival_ns - self._first[1]
+        late_ns = elapsed_ns - round(records * NS_PER_S / self._rate_hz)
         self._least = late_ns if self._least is None else min(self._least, late_ns)
-        if arrival_ns < self._until_ns or self._waited < self._LEAST:
+        self._waited += waited
+        early = self._usual is not None and self._least < self._usual
+        if arrival_ns < self._until_ns or (self._waited < self._LEAST and not early):
             return
-        if self._usual is None or elapsed_ns < 3 * self._EVERY_NS:  # the very first record may have waited
-            self._usual = self._least if self._usual is None else min(self._usual, self._least)
-        if abs(self._least - self._usual) > allowed_ns:
-            self.measured_hz = self._records * NS_PER_S / elapsed_ns
+        if self._usual is None:
+            self._usual = self._floor = self._least
+        allowed_ns = self._ALLOWED_NS + self._DRIFT * elapsed_ns
+        step = min(self._least - self._floor, 0) if early else self._least - self._usual
+        if abs(step) > allowed_ns:
+            if step * self._step > 0:
+                self.measured_hz = records * NS_PER_S / elapsed_ns
+            self._usual, self._floor, self._step = self._least, min(self._least, self._floor), step
+        elif self._usual - self._least > allowed_ns:
+            self._usual, self._step = self._least, 0
         self._least, self._waited, self._until_ns = None, 0, arrival_ns + self._EVERY_NS
 
 
@@ -195,26 +195,20 @@ class NetFt:
         self._calibration: NetFtScale | None = None
         self._records: deque[tuple[int, bool, bytes]] = deque()
         self._rate = _RateCheck(config.rate_hz)
-        self._first_opened_ns: int | None = None
-        self._number: int | None = None  # of the last record, which goes on where the sensor's runs around
-        self._began_ns = 0  # of its numbers, which may begin anew whenever it is opened; since it was first opened
+        self._last: _Last | None = None
+        self._per_record = 0.0  # of the sensor's internal samples
+        self._reopened = False  # since the last record
 
     @property
     def identity(self) -> Identity:
         c = self._config
         counts = {} if self._calibration is None else dataclasses.asdict(self._calibration)
         where = f"udp://{c.host}:{c.rdt_port}"
-        return Identity(
-            sensor="netft", product="ATI Net F/T", where=where, settings=counts, period_s=1 / c.rate_hz,
-            counter_modulus=_NUMBERS,
-        )  # fmt: skip
+        return Identity(sensor="netft", product="ATI Net F/T", where=where, settings=counts, period_s=1 / c.rate_hz)
 
     def __enter__(self) -> Self:
         c = self._config
-        self._rate, self._number = _RateCheck(c.rate_hz), None
-        now_ns = time.monotonic_ns()
-        self._first_opened_ns = now_ns if self._first_opened_ns is None else self._first_opened_ns
-        self._began_ns = now_ns - self._first_opened_ns
+        self._reopened = True
         try:
             self._calibration = parse_calibration(self._ask_calibration())
             self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -241,18 +235,17 @@ class NetFt:
         if not self._records:
             self._receive(timeout_s)
         stamp_ns, waited, record = self._records.popleft()
-        number, _, status, *counts = RECORD.unpack(record)
+        told, internal, status, *counts = RECORD.unpack(record)
+        number = self._number(told, internal, stamp_ns)
         if status & _STATUS_ERROR and not status & _STATUS_RANGE:
-            raise DeviceDataError(f"NetFT record {number} has status {status:#010x}: {_meaning(status)}")
+            raise DeviceDataError(f"NetFT record {told} has status {status:#010x}: {_meaning(status)}")
         assert self._calibration is not None
         values = np.array(counts, np.float64)
-        period_ns, last = NS_PER_S / self._config.rate_hz, number if self._number is None else self._number
-        self._number = last + (number - last + _NUMBERS // 2) % _NUMBERS - _NUMBERS // 2
         self._check_rate(number, stamp_ns, waited)
         timed = self._rate.measured_hz is None
         return Sample(
             host_time_ns=stamp_ns,
-            device_time_ns=self._began_ns + round(self._number * period_ns) if timed else None,
+            device_time_ns=round(number * NS_PER_S / self._config.rate_hz) if timed else None,
             index=number,
             arrays={
                 "force_n": (values[:3] / self._calibration.counts_per_n).astype(np.float32),
@@ -264,6 +257,27 @@ class NetFt:
     def take_zero(self) -> None:
         """Make the sensor take its present load as zero; only `force-zero` leaves a trace in the records."""
         self._command(Command.BIAS)
+
+    def _number(self, told: int, internal: int, stamp_ns: int) -> int:
+        """Number of a record, which goes on where the sensor's runs around or begins anew.
+
+        A sensor numbers the records of every stream anew, its internal samples as long as it has power: then it cannot
+        have taken more than there was time for.
+        """
+        last, steps = self._last, 0
+        if last is not None and not self._reopened:
+            steps = _signed(told - last.told)
+            self._per_record = _signed(internal - last.internal) / steps if steps else self._per_record
+        elif last is not None and self._per_record > 0:
+            taken = round(_signed(internal - last.internal) / self._per_record)
+            there_was_time = taken * NS_PER_S / self._config.rate_hz < stamp_ns - last.stamp_ns + HELD_NS
+            steps = max(0, taken) if there_was_time else 0
+        if last is None or (self._reopened and not steps):
+            self._rate, number = _RateCheck(self._config.rate_hz), told
+        else:
+            number = last.number + steps
+        self._last, self._reopened = _Last(number, told, internal, stamp_ns), False
+        return number
 
     def _check_rate(self, number: int, stamp_ns: int, waited: bool) -> None:
         """Warn once of a wrong rate; from then on a record has the time of its arrival alone."""
@@ -326,6 +340,20 @@ class NetFt:
         if self._socket is not None:
             self._socket.close()
             self._socket = None
+
+
+class _Last(NamedTuple):
+    """The last record: its number, the numbers that the sensor told of it and of its internal sample, its arrival."""
+
+    number: int
+    told: int
+    internal: int
+    stamp_ns: int
+
+
+def _signed(difference: int) -> int:
+    """Of two numbers that run around: the shorter way."""
+    return (difference + _NUMBERS // 2) % _NUMBERS - _NUMBERS // 2
 
 
 def _meaning(status: int) -> str:

@@ -100,15 +100,15 @@ def test_times_never_run_backward_where_a_link_gets_slower_and_recovers(late_s):
         assert not clock.slow
 
 
-@given(st.lists(st.tuples(st.integers(0, 5), st.booleans()), min_size=1, max_size=60), st.sampled_from([None, 256]))
-def test_drops_and_duplicates_of_a_counter_are_all_found(plan, modulus):
+@given(st.lists(st.tuples(st.integers(0, 5), st.booleans()), min_size=1, max_size=60))
+def test_drops_and_duplicates_of_a_counter_are_all_found(plan):
     """Each entry: how many are dropped before a sample, and whether it comes twice."""
-    gaps, index, missing, duplicates = IndexGaps(modulus), 250, 0, 0
+    gaps, index, missing, duplicates = IndexGaps(), 250, 0, 0
     gaps.step(index)
     for dropped, twice in plan:
         index += dropped + 1
         for _ in range(1 + twice):
-            step = gaps.step(index if modulus is None else index % modulus)
+            step = gaps.step(index)
             missing += step.missing
             duplicates += step.duplicate
     assert missing == sum(dropped for dropped, _ in plan)
@@ -123,9 +123,7 @@ def test_a_late_sample_is_told_from_a_duplicate_and_a_restart():
     assert steps[4].duplicate
     assert steps[6].restarted
     assert not any(s.restarted for s in steps[:6])
-    gaps = IndexGaps(2**32)
-    gaps.step(3 * 10**9)
-    assert gaps.step(7, reopened=True).restarted  # and not 1.3 10⁹ ahead, around the end of the counter
+    assert gaps.step(5, reopened=True).restarted
 
 
 def test_periods_count_what_is_missing_and_take_back_what_was_late():

@@ -60,6 +60,15 @@ def test_a_broken_sample_is_lost_once():
     assert (intake.counts.missing, intake.counts.broken, intake.counts.lost) == (2, 1, 3)
 
 
+def test_a_broken_sample_that_a_period_counts_is_taken_back_once():
+    """What comes early takes back one that was counted as missing, and then as broken."""
+    intake = Intake(capacity=9, clock=JumpingClock())
+    intake.opened(Identity(sensor="xense", period_s=0.01))
+    for time_ms in (0, 10, 20, None, 40, 42):
+        intake.broke() if time_ms is None else intake.offer(sample(time_ms=time_ms))
+    assert (intake.counts.missing, intake.counts.broken, intake.counts.lost) == (0, 1, 1)
+
+
 def test_messages_of_a_program_that_still_starts_are_no_samples(vendor):
     sender, port = vendor
     starting = message({**FINE, "InitializeProgress": np.array([[40.0]])})
@@ -210,6 +219,20 @@ def test_a_reader_that_waits_no_more_still_sees_that_records_come_too_early():
     assert check.measured_hz == pytest.approx(7000, rel=0.01)
 
 
+@pytest.mark.parametrize(
+    ("late_ms", "begin_s", "end_s", "slept_s"), [(200, 2.02, 4.02, 0), (30, 2, 5, 0), (1000, 0, 3, 0), (0, 0, 0, 60)]
+)
+def test_a_link_that_is_late_and_a_machine_that_slept_are_no_wrong_rate(late_ms, begin_s, end_s, slept_s):
+    """Its clock stands still while a machine sleeps."""
+    check, arrival_ns = _RateCheck(1000.0), 0
+    for k in range(8000):
+        due_ns = (k + late_ms * (begin_s <= k / 1000 < end_s)) * 10**6
+        waited = due_ns > arrival_ns
+        arrival_ns = due_ns if waited else arrival_ns + 2 * 10**5  # so long takes a record that had waited
+        check.step(k + 1000 * slept_s * (k >= 3000), arrival_ns, waited)
+    assert check.measured_hz is None
+
+
 def test_a_wrong_rate_of_a_force_sensor_warns_and_leaves_its_stamps_out():
     class Slow(list):
         """Records every 10 ms: 100 a second."""
@@ -220,10 +243,10 @@ def test_a_wrong_rate_of_a_force_sensor_warns_and_leaves_its_stamps_out():
                 yield datagram
 
     with (
-        sensor(Slow(record(k, *[0] * 6) for k in range(80))) as (config, _),
+        sensor(Slow(record(k, *[0] * 6) for k in range(110))) as (config, _),
         config.open() as device,
         pytest.warns(WrongRateWarning, match="rate_hz is 1000"),
     ):
-        stamps = [device.read(5.0).device_time_ns for _ in range(80)]
+        stamps = [device.read(5.0).device_time_ns for _ in range(110)]
     assert stamps[0] == 0
     assert stamps[-5:] == [None] * 5

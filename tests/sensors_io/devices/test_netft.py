@@ -48,8 +48,8 @@ def sensor(datagrams, calibration=NEWTONS):
             thread.join()
 
 
-def record(number, *counts, status=0):
-    return RECORD.pack(number, 10 * number % 2**32, status, *counts)
+def record(number, *counts, status=0, internal=None):
+    return RECORD.pack(number, 10 * number % 2**32 if internal is None else internal, status, *counts)
 
 
 def test_counts_become_newtons_and_newton_millimetres():
@@ -58,28 +58,44 @@ def test_counts_become_newtons_and_newton_millimetres():
         sample = device.read(5.0)
         device.take_zero()
         assert device.identity.settings["counts_per_nmm"] == 1000
-        assert device.identity.counter_modulus == 2**32
     np.testing.assert_allclose(sample.arrays["force_n"], [1, -2, -7.5])
     np.testing.assert_allclose(sample.arrays["moment_nmm"], [1, 0, -2000])
     assert (sample.index, sample.device_time_ns) == (5, 5_000_000)
     assert commands == [(HEADER, Command.STREAM, 0), (HEADER, Command.BIAS, 0), (HEADER, Command.STOP, 0)]
 
 
-def test_numbers_of_a_sensor_that_was_opened_again_have_times_of_their_own():
-    """Else those of one that was switched off and on could go on where the old ones ended, seconds too early."""
-    stamps = []
-    with sensor([record(5, *[0] * 6)]) as (config, _), config.open() as device:
-        stamps.append(device.read(5.0).device_time_ns)
-    with sensor([record(6, *[0] * 6)]) as (device._config, _), device:
-        stamps.append(device.read(5.0).device_time_ns)
-    assert stamps[1] - stamps[0] > 1_000_000  # that of the numbers alone
+@pytest.mark.parametrize(
+    ("told", "then", "number"),
+    [
+        ([(1, 70), (2, 77)], (1, 777), 102),  # each stream begins at 1, a hundred records after the first ended
+        ([(1, 70), (5, 98), (3, 84)], (1, 105), 6),  # of the first some were lost, and one was overtaken
+        ([(1, 2**32 - 7), (2, 0)], (1, 7), 3),
+        ([(1, 70), (2, 77)], (1, 7), 1),  # its power failed
+        ([(1, 2**32 - 14), (2, 2**32 - 7)], (1, 0), 3),  # internal samples run around
+        ([(1, 4 * 10**9), (2, 4 * 10**9 + 7)], (1, 7), 1),  # its power failed after six days
+        ([(1, 70), (2, 77)], (1, 10**7), 1),  # a hundred thousand records at once
+        ([(1, 0), (2, 0)], (1, 0), 1),  # it counts no internal samples
+        ([(1, 70)], (1, 777), 1),  # how many a record has is not known
+    ],
+)
+def test_a_number_goes_on_when_the_sensor_is_opened_again(told, then, number):
+    """By its internal samples: a late link is opened again too, and its records are no later than before."""
+    with sensor([record(k, *[0] * 6, internal=n) for k, n in told]) as (config, _), config.open() as device:
+        for _ in told:
+            device.read(5.0)
+        rate = device._rate
+    with sensor([record(then[0], *[0] * 6, internal=then[1])]) as (device._config, _), device:
+        found = device.read(5.0)
+    assert (found.index, found.device_time_ns) == (number, number * 1_000_000)
+    assert (device._rate is rate) == (number != then[0])  # how late the link was before is still known
 
 
 def test_a_number_that_runs_around_does_not_set_the_clock_back():
     numbers = [2**32 - 2, 2**32 - 1, 0, 1]
     with sensor([b"".join(record(n, *[0] * 6) for n in numbers)]) as (config, _), config.open() as device:
-        stamps = [device.read(5.0).device_time_ns for _ in numbers]
-    assert np.diff(stamps).tolist() == [1_000_000] * 3
+        found = [device.read(5.0) for _ in numbers]
+    assert np.diff([s.device_time_ns for s in found]).tolist() == [1_000_000] * 3
+    assert np.diff([s.index for s in found]).tolist() == [1] * 3
 
 
 def test_buffered_records_are_spread_over_their_periods():

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from sensors_io.clock import JumpingClock, MonotonicClock
-from sensors_io.devices.base import Identity
 from sensors_io.devices.errors import (
     DeviceDataError,
     DeviceLostError,
@@ -149,17 +148,19 @@ def test_a_counter_that_restarts_on_reconnecting_leaves_the_loss_to_the_clock(st
 
 
 @pytest.mark.parametrize(
-    ("numbers", "arrival_ms", "lost_at", "times_ms"),
+    ("numbers", "counts", "arrival_ms", "lost_at", "times_ms"),
     [
-        ([4, 5, 7, 6, 8], [40, 50, 70, 78, 80], None, [40, 50, 70, 60, 80]),
-        ([4, 5, 6, 7, 8], [40, 50, 900, 901, 902], 2, [40, 50, 60, 70, 80]),
-        ([4, 5, 6, 7, 8], [40, 50, 5060, 5070, 5080], 2, [40, 50, 5060, 5070, 5080]),
+        ([4, 5, 7, 6, 8], True, [40, 50, 70, 78, 80], None, [40, 50, 70, 60, 80]),
+        ([4, 5, 6, 7, 8], True, [40, 50, 900, 901, 902], 2, [40, 50, 60, 70, 80]),
+        ([4, 5, 6, 7, 8], False, [40, 50, 900, 901, 902], 2, [40, 50, 60, 70, 80]),
+        ([4, 5, 0, 1, 2], False, [40, 50, 900, 910, 920], 2, [40, 50, 900, 910, 920]),
+        ([4, 5, 6, 7, 8], True, [40, 50, 5060, 5070, 5080], 2, [40, 50, 5060, 5070, 5080]),
     ],
-    ids=["overtaken", "held up for longer than a device may be silent", "started again"],
+    ids=["overtaken", "held up for longer than a device may be silent", "camera", "its clock anew", "started again"],
 )
-def test_late_samples_whose_stamps_go_with_their_numbers_have_their_own_times(numbers, arrival_ms, lost_at, times_ms):
+def test_late_samples_whose_stamps_go_on_have_their_own_times(numbers, counts, arrival_ms, lost_at, times_ms):
     stamped = zip(numbers, arrival_ms, strict=True)
-    script = [sample(index, time_ms, device_time_ns=10 * index * MS) for index, time_ms in stamped]
+    script = [sample(n if counts else None, time_ms, device_time_ns=10 * n * MS) for n, time_ms in stamped]
     if lost_at is not None:
         script.insert(lost_at, DeviceLostError("x"))
     got = drain(pumped(Scripted(script, period_s=0.01)))
@@ -235,11 +236,3 @@ def test_an_absent_device_and_a_bug_in_a_driver_reach_the_caller():
         with pytest.raises(DeviceLostError, match="ZeroDivisionError") as failed:
             reader.next(5.0)
     assert isinstance(failed.value.__cause__, ZeroDivisionError)
-
-
-def test_reopening_forgets_nothing_of_the_first_identity():
-    intake = Intake(capacity=4, clock=JumpingClock())
-    intake.opened(Identity(sensor="netft", counter_modulus=8))
-    for index in (6, 7, 0, 2):
-        intake.offer(sample(index))
-    assert intake.counts.missing == 1

@@ -48,6 +48,14 @@ def test_a_force_that_is_not_finite_changes_nothing(at):
     assert not any(a.done for a in advice)
 
 
+def test_a_force_from_before_the_touch_that_comes_late_is_no_letting_go():
+    coach = Coach(ContactStage(motion="press", force_n=20), CONFIG)
+    forces = [(0, 0), (50, 0), (100, 0), (150, 0), (200, 5), (180, 0), (250, 10), (300, 20)]
+    advice = [coach.step(ms * 1_000_000, np.array([0, 0, -n])) for ms, n in forces]
+    assert [a.done for a in advice] == [False] * 7 + [True]
+    assert advice[-1].complete
+
+
 def test_nothing_begins_while_something_touches():
     assert not any(a.recording for a in led(ContactStage(motion="press", force_n=20), [5] * 20))
 
