@@ -53,7 +53,11 @@ def stage_hooks(
     folder = context.checkpoint_dir(stage)
     with (
         Checkpoints(
-            folder, better="higher" if scored else None, print_=context.print, of=labelled(context.directory, stage)
+            folder,
+            better="higher" if scored else None,
+            print_=context.print,
+            of=labelled(context.directory, stage),
+            saved=lambda: context.seal_log(stage),
         ) as checkpoints,
         context.timed(stage),
         context.stopping.patient(context.processes.any) as stopping,
@@ -64,6 +68,7 @@ def stage_hooks(
         def resumed(start: int) -> None:
             context.require_logged(stage, start)
             context.rewind(stage, start)
+            context.seal_log(stage)
             log_step = make_log(context, stage, start)
             advance = bar.enter_context(context.progress(stage, steps, min(start, steps), note=COMPILING))
 
@@ -86,7 +91,7 @@ def stage_hooks(
         )
         bar.close()
         _tell(context, stage, times, max(left_out))
-    context.ended(stage)
+    context.seal_log(stage)
 
 
 def _tell(context: Context, stage: str, times: LoopTime, left_out: float) -> None:

@@ -26,6 +26,7 @@ from touchr1_jax.types import Params
 
 FIGURES = ("acc", "h_acc", "r_acc", "p_acc", "mat_acc", "omae", "parse_rate")  # metrics of a model card
 POLICIES = "policies"  # folder of a run with its trained policies
+FILE = "file"  # note with the policy's place and its run, see `runs.labelled`
 SCENES = "scenes"  # note with the configuration of the generated scenes that a policy was trained on
 
 ONLY_SCENES = "generated scenes only: pictures of real sensors look different, and answers about them are guesses"
@@ -46,6 +47,7 @@ def publish_policy(policy: TouchPolicy, params: Params, data: Dataset, name: str
         "name": f"{context.directory.parent.name}, {name}, seed {seed}",
         "trained on": f"{meta.source}: {summary['sft_objects']} objects by SFT, {summary['grpo_objects']} for GRPO",
         "records": data.store.digest,
+        FILE: runs.labelled(context.directory, f"{POLICIES}/{name}/{seed}"),
         SCENES: meta.notes.get("config", {}),
     } | ({"limits": ONLY_SCENES} if meta.source == "generated" else {})
     saved = SavedPolicy(policy=policy, params=params, reads=reads, notes=jsonable(notes))
@@ -78,7 +80,10 @@ def find_policy(name: str, runs_dir: Path, weights: Path | None = None) -> Askab
     path = Path(name)
     folder = run_policy(name, runs_dir)
     if folder is not None:
-        return load_policy(folder, weights)
+        found, own = load_policy(folder, weights), runs.labelled(folder.parents[2], "/".join(folder.parts[-3:]))
+        if (said := found.saved.notes.get(FILE, own)) != own:
+            raise PolicyError(f"policy is {folder}: it is of {said}, must be of {own}; put its own copy back")
+        return found
     if not name or name.startswith(HUB) or path.exists() or name in shipped():
         return load_policy(name or None, weights)
     raise PolicyError(
