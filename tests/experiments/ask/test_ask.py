@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import json
 import re
+import shutil
 import socket
 import sys
 import types
@@ -19,7 +20,7 @@ from experiments.ask.command import run_asking
 from experiments.ask.demo import demo_server
 from experiments.ask.inputs import read_touch
 from experiments.core.errors import DataError
-from experiments.core.runs import ROOT
+from experiments.core.runs import FIELDS, ROOT
 from experiments.study.policies import find_policy, is_policy, publish_policy
 from experiments.study.stages import encode_rows
 from sensors_io.commands.console import print_in_any_encoding
@@ -37,7 +38,8 @@ def runs(tmp_path_factory, policy, params, data):
     """A run `trial/latest` with a policy of SFT."""
     run = tmp_path_factory.mktemp("runs") / "trial" / "latest"
     run.mkdir(parents=True)
-    (run / "config.json").write_text(json.dumps({"experiment": "trial"}))
+    about = dict.fromkeys(FIELDS, "") | {"experiment": "trial", "config": {}, "git": {"commit": "", "dirty": False}}
+    (run / "config.json").write_text(json.dumps(about))
     scores = {"acc": {"mean": 68.13, "ci95": [60.0, 70.0], "per_seed": [68.13]}}
     (run / "results.json").write_text(json.dumps({"arms": {"sft": scores}, "data": {"test_objects": 5}}))
     context = types.SimpleNamespace(directory=run, processes=types.SimpleNamespace(write_once=lambda write: write()))
@@ -48,6 +50,18 @@ def runs(tmp_path_factory, policy, params, data):
 @pytest.fixture(scope="module")
 def asked(runs):
     return find_policy(str(runs / "trial"), runs)
+
+
+def test_a_policy_of_another_run_arm_or_seed_is_not_taken_for_a_run_s_own(runs, tmp_path):
+    trial = runs / "trial" / "latest"
+    for steps, place in ((9, "sft/0"), (0, "sft/1"), (0, "paper/0")):
+        run = tmp_path / f"{steps}{place.replace('/', '-')}"
+        shutil.copytree(trial / "policies" / "sft" / "0", run / "policies" / place)
+        about = json.loads((trial / "config.json").read_text()) | ({"config": {"steps": steps}} if steps else {})
+        (run / "config.json").write_text(json.dumps(about))
+        with pytest.raises(PolicyError, match=r"it is of policies/sft/0 \w{8}, must be of .*; put its own copy back"):
+            find_policy(f"{run}/{place}", runs)
+        find_policy(str(run / "policies" / place), runs)  # by its folder it is a policy as any other
 
 
 def ask(runs, *words):
