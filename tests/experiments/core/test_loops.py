@@ -123,7 +123,7 @@ def test_no_run_ends_with_a_part_of_its_log(whole, tmp_path, capsys, kept, ended
 
 
 def test_no_run_goes_on_with_the_log_of_another(tmp_path, capsys, monkeypatch):
-    """Both were killed in the middle of the same stage; only the learning rates of their steps differ."""
+    """Both were killed in the middle of the same stage."""
     append = MetricLog.append
 
     def die(log, stage, step, scalars):
@@ -133,9 +133,9 @@ def test_no_run_goes_on_with_the_log_of_another(tmp_path, capsys, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(MetricLog, "append", die)
-        for folder, steps in (("one", "12"), ("other", "14")):
+        for folder, options in (("one", ()), ("other", ("--poison-from", "3", "--poison-to", "5"))):
             with pytest.raises(KeyboardInterrupt):
-                run_counting(tmp_path / folder, "--steps", steps)
+                run_counting(tmp_path / folder, *options)
     log, other = (run_directory(tmp_path / folder) / "metrics.jsonl" for folder in ("one", "other"))
     own = log.read_bytes()
     shutil.copy(other, log)
