@@ -56,8 +56,9 @@ class MetricLog:
         return found
 
     def summary_of(self, stage: str) -> list[int]:
-        """`summary` of the lines of a stage."""
-        with self._lock:
+        """`summary` of the lines of a stage, which are on the disk then."""
+        with self._lock, self._named():
+            os.fsync(self._file.fileno())
             return self._sums[stage] if stage in self._sums else summary(self.by_stage().get(stage, []))
 
     def _replace(self, lines: list[str], by: list[str]) -> None:

@@ -276,11 +276,12 @@ def read_run(directory: Path) -> PastRun:
     path, times, results = (directory / f"{name}.json" for name in ("config", "timing", "results"))
     if not path.exists():
         raise FileNotFoundError(f"{directory} holds no config.json: must be the directory of a run; correct the path")
+    description = read_description(directory)
     run = PastRun(
         directory=directory,
-        description=read_description(directory),
+        description=description,
         seconds=_object(times).get("total") if times.exists() else None,  # stages come before the total
-        results=_results(results, read_description(directory)) if results.exists() else None,
+        results=_results(results, description) if results.exists() else None,
         in_use=_in_use(directory),
     )
     with fitting(times):  # what `list` shows is made once here, so that a file of another shape is named at once

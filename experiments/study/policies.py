@@ -80,8 +80,9 @@ def find_policy(name: str, runs_dir: Path, weights: Path | None = None) -> Askab
     path = Path(name)
     folder = run_policy(name, runs_dir)
     if folder is not None:
-        found, own = load_policy(folder, weights), runs.labelled(folder.parents[2], "/".join(folder.parts[-3:]))
-        if (said := found.saved.notes.get(FILE, own)) != own:
+        found = load_policy(folder, weights)
+        said = found.saved.notes.get(FILE)  # those of earlier versions do not say
+        if said and said != (own := runs.labelled(folder.parents[2], "/".join(folder.parts[-3:]))):
             raise PolicyError(f"policy is {folder}: it is of {said}, must be of {own}; put its own copy back")
         return found
     if not name or name.startswith(HUB) or path.exists() or name in shipped():
