@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from sensors_io.schema import Flag, Sequence
-from sensors_io.selection import field_images, pick_frames
+from sensors_io.selection import pick_frames
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -172,10 +172,9 @@ def oddities(
         found["no change between pictures"] = not even and _stands_still(shown.frames)
     if shown.depth_mm is not None:
         found["no contact in any frame"] = bool(untouched(shown.depth_mm, shown.valid, config).all())
-    if shown.depth_mm is not None or shown.deformation_mm is not None:
-        seen = lambda n: field_images(pick_frames(shown, np.array([n])))  # one at a time: whole, they would be large
-        later = range(1, len(shown))
-        found["no change between fields"] = bool(later) and all((seen(n) == seen(0)).all() for n in later)
+    fields = [field for field in (shown.deformation_mm, shown.depth_mm) if field is not None]
+    unread = shown.valid is not None and not shown.valid.any()
+    found["no change between fields"] = bool(fields) and (unread or all(map(_stands_still, fields)))
     return tuple(name for name, holds in found.items() if holds)
 
 

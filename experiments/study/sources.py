@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 
+from experiments.core import numerics
 from experiments.core.context import Context
 from experiments.core.progress import ProgressCallback
 from experiments.study.dataset import Dataset, open_dataset, require_same_records
@@ -62,7 +63,8 @@ def prepare_records(config: SourceConfig, context: Context) -> Path:
     if config.data == "records":
         return config.data_dir
     source, settings = config.data_dir.resolve(), config.physiclear
-    identity = json.dumps([str(source), dataclasses.asdict(settings)], sort_keys=True)
+    about = [str(source), dataclasses.asdict(settings), *filter(None, [numerics.environment()])]  # decoded by OpenCV
+    identity = json.dumps(about, sort_keys=True)
     path = context.cache_dir / f"physiclear-{hashlib.sha256(identity.encode()).hexdigest()[:16]}"
     _make(context, "importing videos", lambda report: import_physiclear(source, path, config=settings, progress=report))
     return path

@@ -114,6 +114,8 @@ def test_imported_videos_are_named_by_folder_and_settings(tmp_path, context, mon
     assert paths[3] == paths[0]
     assert imported[:2] == [(paths[0], PhysiclearConfig()), (paths[1], PhysiclearConfig(height=60))]
     assert all(path.parent == context.cache_dir and path.name.startswith("physiclear-") for path in paths)
+    monkeypatch.setenv("OPENCV_IPP", "disabled")
+    assert prepare_records(first, context) not in paths
 
 
 def test_odd_contacts_of_recordings_are_listed_before_training_and_left_out_on_request(data, tmp_path, context):
