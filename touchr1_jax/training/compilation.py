@@ -57,7 +57,9 @@ def compilations_kept(directory: Path, least_s: float = WORTH_KEEPING_S) -> Iter
         "jax_persistent_cache_min_compile_time_secs": least_s,
     }
     before = {name: jax.config.values[name] for name in settings}
-    without_sums = {name: vars(jax_cache)[name] for name in ("zstd", "zstandard") if name in vars(jax_cache)}
+    without_sums: dict[str, Any] = {
+        name: vars(jax_cache)[name] for name in ("zstd", "zstandard") if name in vars(jax_cache)
+    }
     vars(jax_cache).update(dict.fromkeys(without_sums))
     _set(settings)
     try:
