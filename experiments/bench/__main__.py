@@ -45,7 +45,9 @@ from touchr1_jax.bench.scoring import BENCH_METRICS
 
 OUT = Console(highlight=False, emoji=False)
 
-KNOWN_ERRORS = (card.CardError, QuotaError, ContactError, ItemError, LinesError, SheetError, UserError, OSError)
+KNOWN_ERRORS = (
+    card.CardError, QuotaError, ContactError, ItemError, LinesError, SheetError, DamagedFileError, UserError, OSError,
+)  # fmt: skip
 """Errors that are shown as their message, without a traceback."""
 
 Records = tyro.conf.Positional[Path]

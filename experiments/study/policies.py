@@ -96,11 +96,11 @@ def find_policy(name: str, runs_dir: Path, weights: Path | None = None) -> Askab
 def measured_figures(name: str, runs_dir: Path) -> dict[str, str]:
     """Scores of a run's policy on unseen objects, for its model card; empty for other policies and unfinished runs."""
     folder = run_policy(name, runs_dir)
-    results = None if folder is None else folder.parents[2] / "results.json"
-    if folder is None or results is None or not results.exists():
+    results = None if folder is None else runs.read_run(folder.parents[2]).results
+    if folder is None or results is None:
         return {}
-    with fitting(results):
-        return _measured(read_json(results), folder.parent.name)
+    with fitting(folder.parents[2] / "results.json"):
+        return _measured(results, folder.parent.name)
 
 
 def _measured(found: Any, arm: str) -> dict[str, str]:
