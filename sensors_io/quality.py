@@ -11,8 +11,7 @@ from collections.abc import Collection, Mapping
 import cv2
 import numpy as np
 
-from sensors_io.schema import Flag, Sequence
-from sensors_io.selection import pick_frames
+from sensors_io.schema import FRAME_ARRAYS, Flag, Sequence
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -162,7 +161,10 @@ def oddities(
         "every frame flagged": bool(sequence.flags.all()),
     }
     used = np.flatnonzero((sequence.flags & np.uint32(sum(rejected))) == 0)
-    shown = sequence if len(used) in (0, len(sequence)) else pick_frames(sequence, used)
+    shown = sequence
+    if 0 < len(used) < len(sequence):
+        arrays = {name: getattr(sequence, name) for name in FRAME_ARRAYS}
+        shown = dataclasses.replace(sequence, **{name: x[used] for name, x in arrays.items() if x is not None})
     found["one frame"] = len(shown) == 1
     if shown.frames is not None:
         small, even = shown.frames.shape[1:3] == (1, 1), all((f == f[:1, :1]).all() for f in shown.frames)

@@ -50,14 +50,10 @@ def stage_hooks(
       describe: of the sample that a step returns, what people see; without it no step returns one.
     """
     times, logs, left_out = LoopTime(), list[Log](), [0.0]
-    folder = context.checkpoint_dir(stage)
+    folder, of, seal = context.checkpoint_dir(stage), labelled(context.directory, stage), context.seal_log
     with (
         Checkpoints(
-            folder,
-            better="higher" if scored else None,
-            print_=context.print,
-            of=labelled(context.directory, stage),
-            saved=lambda: context.seal_log(stage),
+            folder, better="higher" if scored else None, print_=context.print, of=of, saved=lambda: seal(stage)
         ) as checkpoints,
         context.timed(stage),
         context.stopping.patient(context.processes.any) as stopping,
@@ -68,7 +64,7 @@ def stage_hooks(
         def resumed(start: int) -> None:
             context.require_logged(stage, start)
             context.rewind(stage, start)
-            context.seal_log(stage)
+            seal(stage)
             log_step = make_log(context, stage, start)
             advance = bar.enter_context(context.progress(stage, steps, min(start, steps), note=COMPILING))
 
