@@ -6,7 +6,7 @@ is switched off again leaves no trace: `without` takes its bit back.
 
 import dataclasses
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import cv2
 import numpy as np
@@ -147,24 +147,36 @@ def marked(flags: np.ndarray, found: Mapping[Flag, np.ndarray]) -> np.ndarray:
     return result
 
 
-def oddities(sequence: Sequence, config: QualityConfig | None = None) -> tuple[str, ...]:
-    """Why a legal sequence teaches nothing, or little, about touch; empty for an ordinary one."""
-    config = config or QualityConfig()
+def oddities(
+    sequence: Sequence, config: QualityConfig | None = None, rejected: Collection[Flag] = ()
+) -> tuple[str, ...]:
+    """Why a legal sequence teaches nothing, or little, about touch; empty for an ordinary one.
+
+    Pictures and fields are judged in the frames that are used, without those that are `rejected` for a flag.
+    """
+    config, steps = config or QualityConfig(), np.diff(sequence.host_time_ns)
     found = {
-        "one frame": len(sequence) == 1,
-        "times that run backwards": bool((np.diff(sequence.host_time_ns) < 0).any()),
+        "times that run backwards": bool((steps < 0).any()),
+        "times that stand still": len(steps) > 0 and not steps.any(),
         "every frame flagged": bool(sequence.flags.all()),
     }
-    if sequence.frames is not None:
-        small, even = sequence.frames.shape[1:3] == (1, 1), all((f == f[:1, :1]).all() for f in sequence.frames)
-        colour = {(0,): "black", (255,): "white"}.get(tuple(np.unique(sequence.frames[:, 0, 0])), "of one colour")
+    used = np.flatnonzero((sequence.flags & np.uint32(sum(rejected))) == 0)
+    shown = sequence
+    if 0 < len(used) < len(sequence):
+        arrays = {name: getattr(sequence, name) for name in FRAME_ARRAYS}
+        shown = dataclasses.replace(sequence, **{name: x[used] for name, x in arrays.items() if x is not None})
+    found["one frame"] = len(shown) == 1
+    if shown.frames is not None:
+        small, even = shown.frames.shape[1:3] == (1, 1), all((f == f[:1, :1]).all() for f in shown.frames)
+        colour = {(0,): "black", (255,): "white"}.get(tuple(np.unique(shown.frames[:, 0, 0])), "of one colour")
         found["pictures of one pixel"] = small
         found[f"all pictures {colour}"] = even and not small
-        found["no change between pictures"] = not even and _stands_still(sequence.frames)
-    if sequence.depth_mm is not None:
-        found["no contact in any frame"] = bool(untouched(sequence.depth_mm, sequence.valid, config).all())
-    fields = [field for field in (sequence.deformation_mm, sequence.depth_mm) if field is not None]
-    found["no change between fields"] = bool(fields) and all(map(_stands_still, fields))
+        found["no change between pictures"] = not even and _stands_still(shown.frames)
+    if shown.depth_mm is not None:
+        found["no contact in any frame"] = bool(untouched(shown.depth_mm, shown.valid, config).all())
+    fields = [field for field in (shown.deformation_mm, shown.depth_mm) if field is not None]
+    unread = shown.valid is not None and not shown.valid.any()
+    found["no change between fields"] = bool(fields) and (unread or all(map(_stands_still, fields)))
     return tuple(name for name, holds in found.items() if holds)
 
 
@@ -172,15 +184,13 @@ def _stands_still(rows: np.ndarray) -> bool:
     return len(rows) > 1 and all((row == rows[0]).all() for row in rows[1:])
 
 
-def recorded_digest(recorded: Mapping[str, Sequence]) -> str:
-    """First 16 digits of a hash of a contact's arrays without times: a copy under another name has the same."""
+def recorded_digest(sequence: Sequence) -> str:
+    """First 16 digits of a hash of pictures, else of fields: a copy under another name has the same."""
     digest = hashlib.sha256()
-    for sensor, sequence in sorted(recorded.items()):
-        digest.update(sensor.encode())
-        for name in FRAME_ARRAYS:
-            array = getattr(sequence, name)
-            if array is not None and not name.endswith("time_ns"):
-                digest.update(np.ascontiguousarray(array).tobytes())
+    fields = (sequence.deformation_mm, sequence.depth_mm)
+    for array in fields if sequence.frames is None else (sequence.frames,):
+        if array is not None:
+            digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()[:16]
 
 

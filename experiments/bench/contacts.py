@@ -42,7 +42,7 @@ def measure_split(store: RecordStore, split: str, after_each: Callable[[], None]
                     labels={name: level for name, level in card.labels.items() if level != UNKNOWN},
                     deceptive=card.visual_lies,
                     measured=measured,
-                    fingerprint=recorded_digest(recorded),
+                    fingerprint=" ".join(recorded_digest(recorded[sensor]) for sensor in sorted(recorded)),
                 )
             )
         after_each()

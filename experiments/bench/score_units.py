@@ -43,4 +43,4 @@ def _score(items_file: Path, answers_file: Path, by_sight_file: Path | None, out
         for row in metric_rows(items, answers, None if by_sight_file is None else read(by_sight_file))
     }
     said = f"parsed {100 * parsed_share(answers):.1f} %; {average_line(items, answers)}"
-    write_sealed(out, {"rows": rows, "said": said})
+    write_sealed(out, {"of": out.stem, "rows": rows, "said": said})

@@ -114,15 +114,14 @@ class Context:
             self._stage_file(f"{_LOGGED}/{stage}").unlink(missing_ok=True)
             self._log.rewind(stage, step)
 
-    def ended(self, stage: str) -> None:
-        """Keep the number and the checksum of the lines of a stage that has ended, for `require_log`."""
+    def seal_log(self, stage: str) -> None:
+        """Keep number and checksum of the lines of a stage that was saved or has ended, for `require_log`."""
         self.require_in_place()
         if self._log is not None:
-            lines = self._log.by_stage().get(stage, [])
-            write_sealed(self._stage_file(f"{_LOGGED}/{stage}"), {"lines": summary(lines)})
+            write_sealed(self._stage_file(f"{_LOGGED}/{stage}"), {"lines": self._log.summary_of(stage)})
 
     def require_log(self) -> None:
-        """`DamagedFileError` unless the log has the lines of all stages that have ended; no other look may be taken."""
+        """`DamagedFileError` unless the log has all lines that `seal_log` has seen; no other look may be taken."""
         folder = self.directory / "stages" / _LOGGED
         if self._log is None:
             return

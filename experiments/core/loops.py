@@ -1,8 +1,9 @@
 """Training stages of a run: checkpoints, log, progress bar, wall time, a stop when a signal asks for it."""
 
 import contextlib
+import functools
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any
+from typing import Any, Literal
 
 from experiments.core.context import Context
 from experiments.core.progress import TrainingSample
@@ -53,8 +54,10 @@ def stage_hooks(
     """
     times, logs, left_out = LoopTime(), list[Log](), [0.0]
     folder, of = context.checkpoint_dir(stage), labelled(context.directory, stage)
+    better: Literal["higher"] | None = "higher" if scored else None
+    seal_log = functools.partial(context.seal_log, stage)
     with (
-        Checkpoints(folder, KEPT, better="higher" if scored else None, print_=context.print, of=of) as checkpoints,
+        Checkpoints(folder, KEPT, better=better, print_=context.print, of=of, saved=seal_log) as checkpoints,
         context.timed(stage),
         context.stopping.patient(context.processes.any) as stopping,
         context.compiling(stage.rpartition("/")[0]) as compiled,  # all seeds run one program
@@ -64,6 +67,7 @@ def stage_hooks(
         def resumed(start: int) -> None:
             context.require_logged(stage, start)
             context.rewind(stage, start)
+            seal_log()
             log_step = make_log(context, stage, start)
             advance = bar.enter_context(context.progress(stage, steps, min(start, steps), note=COMPILING))
 
@@ -86,7 +90,7 @@ def stage_hooks(
         )
         bar.close()
         _tell(context, stage, times, max(left_out))
-    context.ended(stage)
+    seal_log()
 
 
 def _tell(context: Context, stage: str, times: LoopTime, left_out: float) -> None:

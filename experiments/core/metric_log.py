@@ -24,18 +24,19 @@ class MetricLog:
 
     def __init__(self, path: Path, watchers: Sequence[Watcher] = ()) -> None:
         self._path, self._watchers, self._lock = path, watchers, threading.RLock()
-        self._seen: set[str] = set()
+        self._sums: dict[str, list[int]] = {}  # `summary` of the lines of each stage of this session
         _rows(path)  # what is damaged is named before anything is trained
         write_text(path, "".join(_whole_lines(path)))  # drops a line that a crash tore
         self._file = path.open("a", encoding="utf-8")
 
     def rewind(self, stage: str, step: int) -> None:
         """Drop the lines of a stage at or past a step: they are about to be computed again."""
-        before = lambda row: row["stage"] != stage or row["step"] < step
         with self._lock:
-            self._seen.add(stage)
             lines = _whole_lines(self._path)
-            self._replace(lines, [line for line in lines if before(_row(line, self._path))])
+            rows = [(line, _row(line, self._path)) for line in lines]
+            kept = [(line, row) for line, row in rows if row["stage"] != stage or row["step"] < step]
+            self._replace(lines, [line for line, _ in kept])
+            self._sums[stage] = summary([line for line, row in kept if row["stage"] == stage])
             for watcher in self._watchers:
                 watcher.rewound(stage, step)
 
@@ -54,6 +55,12 @@ class MetricLog:
             found.setdefault(_row(line, self._path)["stage"], []).append(line)
         return found
 
+    def summary_of(self, stage: str) -> list[int]:
+        """`summary` of the lines of a stage, which are on the disk then."""
+        with self._lock, self._named():
+            os.fsync(self._file.fileno())
+            return self._sums[stage] if stage in self._sums else summary(self.by_stage().get(stage, []))
+
     def _replace(self, lines: list[str], by: list[str]) -> None:
         if lines != by:
             self._file.close()
@@ -68,11 +75,14 @@ class MetricLog:
         values = jsonable(scalars, where=f"{stage} step {step}")
         with self._lock:
             self.require_in_place()
-            if stage not in self._seen:
+            if stage not in self._sums:
                 self.rewind(stage, step)
+            line = seal(json.dumps({"stage": stage, "step": step, **values})) + "\n"
             with self._named():
-                self._file.write(seal(json.dumps({"stage": stage, "step": step, **values})) + "\n")
+                self._file.write(line)
                 self._file.flush()
+            number, sum_ = self._sums[stage]
+            self._sums[stage] = [number + 1, zlib.crc32(line.encode(), sum_)]
             for watcher in self._watchers:
                 watcher.logged(stage, step, values)
 

@@ -49,7 +49,10 @@ ENVIRONMENT: Mapping[str, str] = {
     "OPENBLAS_CORETYPE": "",
     "OPENBLAS_NUM_THREADS": "1",
     "OPENCV_CPU_DISABLE": "",
+    "OPENCV_FFMPEG_CAPTURE_OPTIONS": "",
     "OPENCV_IPP": "",
+    "OPENCV_VIDEOIO_PRIORITY_FFMPEG": "",
+    "OPENCV_VIDEOIO_PRIORITY_LIST": "",
 }
 """Environment variables that accelerators, XLA's oneDNN, NumPy, OpenCV and the C library read, with defaults; they
 count where they differ."""
@@ -70,7 +73,10 @@ def settings() -> dict[str, Any]:
     given = os.environ.get(FLAGS, "").strip()
     if given and not given.startswith("-") and Path(given).is_file():  # XLA then reads its flags from there
         given = Path(given).read_text(encoding="utf-8")
-    flags = sorted(flag for flag in given.split() if not flag.startswith(HARMLESS))
+    last = {
+        flag.partition("=")[0]: flag for flag in given.split() if not flag.startswith(HARMLESS)
+    }  # as XLA takes them
+    flags = sorted(last.values())
     found = {name: jax.config.values[name] for name in SETTINGS} | {FLAGS: flags}
     now = {name: jax.config.values.get(name, default) for name, default in DEFAULTS.items()}
     found |= {name: value for name, value in now.items() if value != DEFAULTS[name]}

@@ -200,11 +200,14 @@ def read_description(directory: Path) -> dict[str, Any]:
 def labelled(directory: Path, name: str) -> str:
     """Name, experiment and configuration that a file of a run states, so that one of another run is not taken for it.
 
-    A folder without `config.json`, such as a unit of work or a part of a run, is told from others by its own name.
+    A folder without `config.json`, such as a unit of work, is told from others by its own name; one in the folder of a
+    run, such as a part of it, by the run too.
     """
     about: Any = directory.name
-    if (directory / "config.json").exists():
-        about = [read_description(directory)[field] for field in ("experiment", "config")]
+    run = directory if (directory / "config.json").exists() else directory.parent
+    if (run / "config.json").exists():
+        about = [read_description(run)[field] for field in ("experiment", "config")]
+        about += [] if run == directory else [directory.name]
     return f"{name} {hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:8]}"
 
 
@@ -273,11 +276,12 @@ def read_run(directory: Path) -> PastRun:
     path, times, results = (directory / f"{name}.json" for name in ("config", "timing", "results"))
     if not path.exists():
         raise FileNotFoundError(f"{directory} holds no config.json: must be the directory of a run; correct the path")
+    description = read_description(directory)
     run = PastRun(
         directory=directory,
-        description=read_description(directory),
+        description=description,
         seconds=_object(times).get("total") if times.exists() else None,  # stages come before the total
-        results=_object(results, "verdict") if results.exists() else None,
+        results=_results(results, description) if results.exists() else None,
         in_use=_in_use(directory),
     )
     with fitting(times):  # what `list` shows is made once here, so that a file of another shape is named at once
@@ -285,6 +289,18 @@ def read_run(directory: Path) -> PastRun:
     with fitting(results):
         " ".join(run.outcome)
     return run
+
+
+def _results(path: Path, description: Mapping[str, Any]) -> dict[str, Any]:
+    """The content of `results.json`; `DamagedFileError` if it is damaged, or of another run than its `config.json`."""
+    found, git = _object(path, "verdict"), str(Revision(**description["git"]))
+    own = {"git": git, **{name: description[name] for name in ("experiment", "scale", "config")}}
+    if other := [name for name, value in own.items() if found.get(name, value) != value]:
+        raise DamagedFileError(
+            f"{path} is of another run, with another {', '.join(other)}: put its own copy back, or move it away and "
+            "continue the run"
+        )
+    return found
 
 
 def _object(path: Path, *lists: str) -> dict[str, Any]:

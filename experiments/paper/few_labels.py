@@ -234,12 +234,11 @@ def with_parts(data: Dataset, labelled: np.ndarray, unlabelled: np.ndarray) -> D
 
 
 def pretrained_encoder(config: FewLabelsConfig, data: Dataset, rows: np.ndarray, context: Context) -> Path:
-    """File of the encoder after stage 1, made once in a run."""
+    """File of the encoder after stage 1, which a run that goes on writes again, from its own checkpoint."""
     path = context.directory / "encoder.npz"
-    if not path.exists():
-        state = pretrain(config.pretrain, data.store, rows, data.clip, context, stage="stage1/0", seed=0)
-        online = dataclasses.replace(state, target=state.params["encoder"])
-        write_bytes(path, encoder_of(config.pretrain, online, data.clip.sensors).to_bytes())
+    state = pretrain(config.pretrain, data.store, rows, data.clip, context, stage="stage1/0", seed=0)
+    online = dataclasses.replace(state, target=state.params["encoder"])
+    write_bytes(path, encoder_of(config.pretrain, online, data.clip.sensors).to_bytes())
     return path
 
 

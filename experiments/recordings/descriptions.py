@@ -77,7 +77,8 @@ def describe_source(source: Path, frames: int, context: Context, objects: int | 
     """Describe so many frames in contact of the videos of a folder that holds labels.json and videos/.
 
     `objects` takes so many labelled ones, the first of the table; `None` takes all, unlabelled ones too.
-    `ImportSourceError` as of `read_labels` and `read_ratings`, or without one readable video.
+    `ImportSourceError` as of `read_labels` and `read_ratings`, or without one readable video; `ConfigurationError` if
+    they are others than the run began with.
     """
     entries = read_labels(source / "labels.json")
     if objects is not None:
@@ -90,7 +91,10 @@ def describe_source(source: Path, frames: int, context: Context, objects: int | 
     rated = read_ratings(source / "ratings.json")
     unknown = np.full(len(LANGUAGE.attributes), np.nan)
     rating = np.array([rated.get(name, unknown) for name in found.objects]).reshape(len(found.names), -1)
-    return dataclasses.replace(found, rating=rating)
+    found, where = dataclasses.replace(found, rating=rating), hashlib.sha256(str(source).encode()).hexdigest()[:16]
+    held = hashlib.sha256(json.dumps([getattr(found, name).tolist() for name in ROWS]).encode()).hexdigest()[:16]
+    context.require_same(f"videos/{where}", held, f"videos, labels or ratings of {source}")
+    return found
 
 
 def read_ratings(path: Path) -> dict[str, Float[np.ndarray, "A"]]:

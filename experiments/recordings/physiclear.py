@@ -142,16 +142,15 @@ def policy_of(config: PhysiclearStudy, data_dir: Path, context: Context) -> Trai
     """The policy of the cache if it was trained on these videos and scenes, else one that is trained now."""
     every = describe_source(data_dir, config.frames, context, config.objects)
     videos, auxiliary = every.labelled(), auxiliary_data(config.scenes, config.scene_sets, every, context)
-    for path in (context.directory / POLICY, cached_policy(config, context)):
-        if path.exists():
-            kept = load(path, config.learn)
-            pairs = [(getattr(kept.training, name), getattr(videos, name)) for name in ("objects", "label", "x")]
-            pairs += [(getattr(kept.auxiliary, name), value) for name, value in vars(auxiliary).items()]
-            pairs.append((np.nan_to_num(kept.training.rating, nan=-1), np.nan_to_num(videos.rating, nan=-1)))
-            if all(np.array_equal(a, b) for a, b in pairs):
-                return kept
-            context.print(f"{path} was trained on other videos or scenes: another policy is trained")
-    (context.directory / POLICY).unlink(missing_ok=True)  # of a session before the videos changed
+    path = cached_policy(config, context)
+    if path.exists():
+        kept = load(path, config.learn)
+        pairs = [(getattr(kept.training, name), getattr(videos, name)) for name in ("objects", "label", "x")]
+        pairs += [(getattr(kept.auxiliary, name), value) for name, value in vars(auxiliary).items()]
+        pairs.append((np.nan_to_num(kept.training.rating, nan=-1), np.nan_to_num(videos.rating, nan=-1)))
+        if all(np.array_equal(a, b) for a, b in pairs):
+            return kept
+        context.print(f"{path} was trained on other videos or scenes, and is made again")
     train_policy(config, videos, auxiliary, context)
     return load(context.directory / POLICY, config.learn)
 
@@ -256,15 +255,14 @@ def training_time(timing: Mapping[str, float], seed: int) -> dict[str, float]:
 def train_policy(config: PhysiclearStudy, videos: DescribedVideos, auxiliary: AuxiliaryData, context: Context) -> None:
     """Train on all objects and keep the policy in the run and, for predictions, in the cache."""
     path = context.directory / POLICY
-    if not path.exists():
-        save(path, learn(config.learn, videos, auxiliary, config.seeds[0], context, "policy"))
+    save(path, learn(config.learn, videos, auxiliary, config.seeds[0], context, "policy"))
     if config.objects is None:
         write_bytes(cached_policy(config, context), path.read_bytes())
 
 
 def cached_policy(config: PhysiclearStudy, context: Context) -> Path:
     """Where the cache keeps the policy of all objects."""
-    return context.cache_dir / f"physiclear-policy-{identity(config.learn)}.npz"
+    return context.cache_dir / f"physiclear-policy-{identity(config.learn)}-{config.seeds[0]}.npz"
 
 
 def requirements(

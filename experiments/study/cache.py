@@ -131,7 +131,7 @@ def _found(path: Path, context: Context, stage: str) -> Params:
         context.rewind(stage, 0)
         for line in lines:
             context.log(stage, **line)
-        context.ended(stage)
+        context.seal_log(stage)
     return params
 
 

@@ -26,6 +26,7 @@ from touchr1_jax.types import Params
 
 FIGURES = ("acc", "h_acc", "r_acc", "p_acc", "mat_acc", "omae", "parse_rate")  # metrics of a model card
 POLICIES = "policies"  # folder of a run with its trained policies
+FILE = "file"  # note with the policy's place and its run, see `runs.labelled`
 SCENES = "scenes"  # note with the configuration of the generated scenes that a policy was trained on
 
 ONLY_SCENES = "generated scenes only: pictures of real sensors look different, and answers about them are guesses"
@@ -46,6 +47,7 @@ def publish_policy(policy: TouchPolicy, params: Params, data: Dataset, name: str
         "name": f"{context.directory.parent.name}, {name}, seed {seed}",
         "trained on": f"{meta.source}: {summary['sft_objects']} objects by SFT, {summary['grpo_objects']} for GRPO",
         "records": data.store.digest,
+        FILE: runs.labelled(context.directory, f"{POLICIES}/{name}/{seed}"),
         SCENES: meta.notes.get("config", {}),
     } | ({"limits": ONLY_SCENES} if meta.source == "generated" else {})
     saved = SavedPolicy(policy=policy, params=params, reads=reads, notes=jsonable(notes))
@@ -78,7 +80,11 @@ def find_policy(name: str, runs_dir: Path, weights: Path | None = None) -> Askab
     path = Path(name)
     folder = run_policy(name, runs_dir)
     if folder is not None:
-        return load_policy(folder, weights)
+        found = load_policy(folder, weights)
+        said = found.saved.notes.get(FILE)  # those of earlier versions do not say
+        if said and said != (own := runs.labelled(folder.parents[2], "/".join(folder.parts[-3:]))):
+            raise PolicyError(f"policy is {folder}: it is of {said}, must be of {own}; put its own copy back")
+        return found
     if not name or name.startswith(HUB) or path.exists() or name in shipped():
         return load_policy(name or None, weights)
     raise PolicyError(
@@ -90,11 +96,11 @@ def find_policy(name: str, runs_dir: Path, weights: Path | None = None) -> Askab
 def measured_figures(name: str, runs_dir: Path) -> dict[str, str]:
     """Scores of a run's policy on unseen objects, for its model card; empty for other policies and unfinished runs."""
     folder = run_policy(name, runs_dir)
-    results = None if folder is None else folder.parents[2] / "results.json"
-    if folder is None or results is None or not results.exists():
+    results = None if folder is None else runs.read_run(folder.parents[2]).results
+    if folder is None or results is None:
         return {}
-    with fitting(results):
-        return _measured(read_json(results), folder.parent.name)
+    with fitting(folder.parents[2] / "results.json"):
+        return _measured(results, folder.parent.name)
 
 
 def _measured(found: Any, arm: str) -> dict[str, str]:

@@ -6,12 +6,13 @@ import hashlib
 import json
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
+from experiments.core import numerics
 from experiments.core.context import Context
 from experiments.core.progress import ProgressCallback
 from experiments.study.dataset import Dataset, open_dataset, require_same_records
@@ -22,7 +23,7 @@ from sensors_io.pipeline import ClipConfig
 from sensors_io.quality import oddities, recorded_digest
 from sensors_io.records import RecordStore
 from sensors_io.scenes.config import SceneConfig, config_hash
-from sensors_io.schema import Sequence
+from sensors_io.schema import Flag, Sequence
 
 Source = Literal["generated", "physiclear", "records"]
 
@@ -62,7 +63,8 @@ def prepare_records(config: SourceConfig, context: Context) -> Path:
     if config.data == "records":
         return config.data_dir
     source, settings = config.data_dir.resolve(), config.physiclear
-    identity = json.dumps([str(source), dataclasses.asdict(settings)], sort_keys=True)
+    about = [str(source), dataclasses.asdict(settings), *filter(None, [numerics.environment()])]  # decoded by OpenCV
+    identity = json.dumps(about, sort_keys=True)
     path = context.cache_dir / f"physiclear-{hashlib.sha256(identity.encode()).hexdigest()[:16]}"
     _make(context, "importing videos", lambda report: import_physiclear(source, path, config=settings, progress=report))
     return path
@@ -82,7 +84,7 @@ def open_source(
     `ConfigurationError` if they are others than the run began with.
     """
     path = prepare_records(config, context)
-    odd = odd_contacts(config, path, context)
+    odd = odd_contacts(config, path, context, clip.rejected)
     data = open_dataset(path, clip, grpo_share, memory_gib, threads, odd if config.drop_odd else ())
     require_same_records(data, context)
     for line in data.levels() if config.data != "generated" else ():
@@ -90,31 +92,43 @@ def open_source(
     return data
 
 
-def odd_contacts(config: SourceConfig, path: Path, context: Context) -> tuple[int, ...]:
-    """Contacts of recordings of which a sequence teaches nothing about touch, printed by reason; none of scenes."""
+def odd_contacts(
+    config: SourceConfig, path: Path, context: Context, rejected: Collection[Flag] = ()
+) -> tuple[int, ...]:
+    """Contacts of recordings of which a sequence teaches nothing about touch, printed by reason; none of scenes.
+
+    `rejected` are the flags of frames that no clip shows where a sequence has others.
+    """
     if config.data == "generated":
         return ()
     store, reasons = RecordStore(path), dict[str, dict[int, str]]()
-    alike, films = dict[str, list[int]](), dict[str, Counter[str]]()
+    alike, films = dict[str, dict[str, int]](), {sensor: Counter[str]() for sensor in store.meta.sensors}
     for i in context.each("looking for odd contacts", range(len(store))):
-        contact = store.contact(i)
-        for sensor, sequence in contact.items():
+        for sensor, sequence in store.contact(i).items():
             films.setdefault(sensor, Counter())[_film(sequence)] += 1
-            for reason in oddities(sequence):
+            for reason in (odd := oddities(sequence, rejected=rejected)):
                 reasons.setdefault(reason, {})[i] = sequence.name
-        alike.setdefault(recorded_digest(contact), []).append(i)
-    for rows in alike.values():
-        twins = {n: store.contacts[n].object_id for n in rows}
-        if len(set(twins.values())) > 1:
-            reasons.setdefault("the same recording as of another object", {}).update(twins)
+            if not odd:  # else black pictures would be copies of each other
+                alike.setdefault(recorded_digest(sequence), {})[sequence.name] = i
+    for same in (list(names.items()) for names in alike.values()):
+        sources = {(store.contacts[i].object_id, name.rpartition("/")[2]) for name, i in same}
+        copies = same if len(sources) > 1 else same[1:]  # of one object and sensor the first is no copy
+        for name, i in copies:
+            reasons.setdefault("the same recording twice", {})[i] = name
     for sensor, kinds in films.items():
-        context.print(f"{sensor}: {_listed([f'{n} of {kind}' for kind, n in kinds.most_common()])}")
+        listed = _listed([f"{n} of {kind}" for kind, n in kinds.most_common()])
+        context.print(f"{sensor}: {listed or 'not recorded in any contact'}")
     what = "are left out" if config.drop_odd else "are trained on (option drop-odd leaves them out)"
     for reason, named in sorted(reasons.items()):
         context.print(f"{reason}: {len(named)} of {len(store)} contacts {what}: {_listed([*named.values()])}")
-    untouched = sorted(store.objects.keys() - {key.object_id for key in store.contacts})
-    if untouched:
-        context.print(f"without any contact: {len(untouched)} of {len(store.objects)} objects, such as {untouched[0]}")
+    touched = {key.object_id for key in store.contacts}
+    bare = {
+        "contact": sorted(store.objects.keys() - touched),
+        "label": [n for n, card in store.objects.items() if card.split != "unlabelled" and max(card.label_row()) < 0],
+    }
+    for what, names in bare.items():
+        if names:
+            context.print(f"without any {what}: {len(names)} of {len(store.objects)} objects, such as {names[0]}")
     return tuple(sorted({i for rows in reasons.values() for i in rows}))
 
 

@@ -62,12 +62,22 @@ def test_odd_but_legal_sequences_are_named() -> None:
         ("no change between pictures",): {"frames": np.repeat(pictures[:1], 3, 0)},
         ("pictures of one pixel",): {"frames": pictures[:, :1, :1]},
         ("times that run backwards",): {"host_time_ns": time[::-1].copy()},
+        ("times that stand still",): {"host_time_ns": 0 * time},
         ("every frame flagged",): {"flags": flags + 4},
         ("no contact in any frame", "no change between fields"): {"depth_mm": np.zeros((3, 4, 4), np.float32)},
         ("no change between fields",): {"frames": None, "deformation_mm": np.ones((3, 4, 4, 2), np.float32)},
     }
     for expected, changes in cases.items():
         assert quality.oddities(dataclasses.replace(whole, **changes)) == expected
+    dark, used = np.arange(3) < 2, {Flag.SATURATED, Flag.NOT_CONVERGED}
+    black = {"frames": np.where(dark[:, None, None, None], 0, pictures), "flags": np.uint32([8, 0, 4])}
+    assert quality.oddities(dataclasses.replace(whole, **black), rejected=used) == ("all pictures black",)
+    assert quality.oddities(dataclasses.replace(whole, flags=np.uint32([2, 8, 4])), rejected=used) == (
+        "every frame flagged",
+        "one frame",
+    )
+    hidden = {"deformation_mm": np.float32(pictures[..., :2]), "valid": np.zeros((3, 4, 4), bool)}
+    assert quality.oddities(dataclasses.replace(whole, **hidden)) == ("no change between fields",)
     one = {name: getattr(whole, name)[:1] for name in ("frames", "host_time_ns", "phase", "flags")}
     assert quality.oddities(dataclasses.replace(whole, **one)) == ("one frame",)
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax._src import compilation_cache as jax_cache  # its compressors have no public name
 from jax.experimental.compilation_cache import compilation_cache
 
 WORTH_KEEPING_S = 0.1
@@ -41,7 +42,8 @@ def compilations_kept(directory: Path, least_s: float = WORTH_KEEPING_S) -> Iter
     folder, because its instructions may differ, so all machines can share the directory.  A cache that is already set,
     for example by `JAX_COMPILATION_CACHE_DIR`, stays in use.
 
-    A half-written entry of a killed process is removed first, because JAX would refuse to write other entries.
+    A half-written entry of a killed process is removed first, because JAX would refuse to write other entries.  Entries
+    are compressed by zlib, whose checksum names a flipped bit: where zstandard is installed JAX takes it without one.
     """
     if jax.config.values["jax_compilation_cache_dir"] is not None:
         yield
@@ -55,10 +57,15 @@ def compilations_kept(directory: Path, least_s: float = WORTH_KEEPING_S) -> Iter
         "jax_persistent_cache_min_compile_time_secs": least_s,
     }
     before = {name: jax.config.values[name] for name in settings}
+    without_sums: dict[str, Any] = {
+        name: vars(jax_cache)[name] for name in ("zstd", "zstandard") if name in vars(jax_cache)
+    }
+    vars(jax_cache).update(dict.fromkeys(without_sums))
     _set(settings)
     try:
         yield
     finally:
+        vars(jax_cache).update(without_sums)
         _set(before)
 
 

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import json
 import re
+import shutil
 import socket
 import sys
 import types
@@ -19,7 +20,7 @@ from experiments.ask.command import run_asking
 from experiments.ask.demo import demo_server
 from experiments.ask.inputs import read_touch
 from experiments.core.errors import DataError
-from experiments.core.runs import ROOT
+from experiments.core.runs import FIELDS, ROOT
 from experiments.study.policies import find_policy, is_policy, publish_policy
 from experiments.study.stages import encode_rows
 from sensors_io.commands.console import print_in_any_encoding
@@ -31,15 +32,17 @@ from touchr1_jax.models.saved_policy import PolicyError
 from touchr1_jax.text.plain_questions import AskedAttribute, QuestionError
 from touchr1_jax.training.evaluation import answer_program, evaluate_policy
 
+ABOUT = dict.fromkeys(FIELDS, "") | {"experiment": "trial", "config": {}, "git": {"commit": "", "dirty": False}}
+
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory, policy, params, data):
     """A run `trial/latest` with a policy of SFT."""
     run = tmp_path_factory.mktemp("runs") / "trial" / "latest"
     run.mkdir(parents=True)
-    (run / "config.json").write_text(json.dumps({"experiment": "trial"}))
+    (run / "config.json").write_text(json.dumps(ABOUT))
     scores = {"acc": {"mean": 68.13, "ci95": [60.0, 70.0], "per_seed": [68.13]}}
-    (run / "results.json").write_text(json.dumps({"arms": {"sft": scores}, "data": {"test_objects": 5}}))
+    (run / "results.json").write_text(json.dumps({"verdict": [], "arms": {"sft": scores}, "data": {"test_objects": 5}}))
     context = types.SimpleNamespace(directory=run, processes=types.SimpleNamespace(write_once=lambda write: write()))
     publish_policy(policy, params, data, "sft", 0, context)
     return run.parents[1]
@@ -48,6 +51,14 @@ def runs(tmp_path_factory, policy, params, data):
 @pytest.fixture(scope="module")
 def asked(runs):
     return find_policy(str(runs / "trial"), runs)
+
+
+@pytest.mark.parametrize(("steps", "place"), [(9, "sft/0"), (0, "sft/1"), (0, "paper/0")])
+def test_a_policy_of_another_run_arm_or_seed_is_not_taken_for_a_run_s_own(runs, tmp_path, steps, place):
+    shutil.copytree(runs / "trial" / "latest" / "policies" / "sft" / "0", tmp_path / "policies" / place)
+    (tmp_path / "config.json").write_text(json.dumps(ABOUT | ({"config": {"steps": steps}} if steps else {})))
+    with pytest.raises(PolicyError, match=r"it is of policies/sft/0 \w{8}, must be of .*; put its own copy back"):
+        find_policy(f"{tmp_path}/{place}", runs)
 
 
 def ask(runs, *words):

@@ -87,6 +87,10 @@ def test_anybody_is_scored(directory, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("experiments.bench.score_units.metric_rows", None)
     assert main(score) == 0  # what was scored is not scored again
     assert capsys.readouterr().out == shown
+    one, other = sorted((tmp_path / "cache" / "scores").glob("*.json"))
+    one.write_bytes(other.read_bytes())
+    assert main(score) == 1
+    assert f"holds the scores of {other.stem}: put its own copy back, or remove it" in capsys.readouterr().err
     assert main([*score[:-1], str(said)]) == 1
     assert f"cache-dir is {said}: must be a folder" in capsys.readouterr().err
     write_lines(said, [{"id": "nobody", "text": "?"}])

@@ -90,7 +90,7 @@ def test_a_foreign_line_is_named_before_anything_is_trained(tmp_path, line):
 def test_lines_of_a_stage_that_has_ended_are_missed(context, kept):
     for step in range(3):
         context.log("sft/0", step, loss=1 / (1 + step))
-    context.ended("sft/0")
+    context.seal_log("sft/0")
     context.log("sft/0", 3, probe=0.5)
     context.require_log()
     path = context.directory / "metrics.jsonl"
@@ -111,7 +111,7 @@ def test_lines_of_a_stage_that_has_ended_are_missed(context, kept):
 )
 def test_a_foreign_file_of_a_run_is_named(context, file, text):
     context.log("sft/0", 0, loss=1.0)
-    context.ended("sft/0")
+    context.seal_log("sft/0")
     (context.directory / file).write_text(text)
     read = context.timing if file == "timing.json" else context.require_log
     with pytest.raises(DamagedFileError, match="is not that of a run"):

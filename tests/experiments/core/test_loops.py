@@ -9,6 +9,7 @@ import pytest
 
 from experiments.core.artifacts import read_json
 from experiments.core.loops import ALARM, alarm_tables, left_out_tables, run_loop
+from experiments.core.metric_log import MetricLog
 from experiments.faults.digests import differences, digests
 from experiments.faults.fixtures import run_counting, run_directory
 from experiments.faults.trainings import counting
@@ -119,6 +120,29 @@ def test_no_run_ends_with_a_part_of_its_log(whole, tmp_path, capsys, kept, ended
     assert ("of the 12 lines of stage count/0 some are missing or changed" if ended else said) in error
     assert "put a copy back, or start a new run with --fresh" in error
     assert not (directory / "results.json").exists()
+
+
+def test_no_run_goes_on_with_the_log_of_another(tmp_path, capsys, monkeypatch):
+    """Both were killed in the middle of the same stage."""
+    append = MetricLog.append
+
+    def die(log, stage, step, scalars):
+        append(log, stage, step, scalars)
+        if step == 9:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(MetricLog, "append", die)
+        for folder, options in (("one", ()), ("other", ("--poison-from", "3", "--poison-to", "5"))):
+            with pytest.raises(KeyboardInterrupt):
+                run_counting(tmp_path / folder, *options)
+    log, other = (run_directory(tmp_path / folder) / "metrics.jsonl" for folder in ("one", "other"))
+    own = log.read_bytes()
+    shutil.copy(other, log)
+    assert run_counting(tmp_path / "one") == 1
+    assert "of the 8 lines of stage count/0 some are missing or changed" in capsys.readouterr().err
+    log.write_bytes(own)
+    assert run_counting(tmp_path / "one") == 0
 
 
 def test_the_best_checkpoint_is_kept_with_the_newest(context):

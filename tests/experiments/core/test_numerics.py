@@ -22,6 +22,7 @@ FAKES = "tests.experiments.fakes"
         ("--xla_cpu_enable_fast_math=true --xla_cpu_max_isa=SSE4_2", 2),
         ("--xla_cpu_multi_thread_eigen=false --xla_backend_optimization_level=0", 2),
         ("--xla_force_host_platform_device_count=8 --xla_dump_to=/tmp/x", 0),
+        ("--xla_cpu_enable_fast_math=false --xla_cpu_enable_fast_math=true", 1),  # the last one counts
     ],
 )
 def test_flags_that_change_results_are_settings(monkeypatch, flags, kept):
@@ -48,6 +49,9 @@ def test_flags_in_a_file_and_variables_of_accelerators_are_settings(monkeypatch,
         ("GLIBC_TUNABLES", "glibc.cpu.hwcaps=-AVX2,-FMA"),
         ("OPENCV_CPU_DISABLE", "AVX2"),
         ("OPENCV_IPP", "disabled"),
+        ("OPENCV_FFMPEG_CAPTURE_OPTIONS", "skip_frame;nokey"),
+        ("OPENCV_VIDEOIO_PRIORITY_FFMPEG", "0"),
+        ("OPENCV_VIDEOIO_PRIORITY_LIST", "CV_MJPEG,FFMPEG"),
         ("OPENBLAS_CORETYPE", "Haswell"),
         ("OPENBLAS_NUM_THREADS", "2"),
     ):

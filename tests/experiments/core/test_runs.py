@@ -174,6 +174,24 @@ def test_a_foreign_file_is_named(tmp_path, file, content):
             runs.newest(tmp_path / "coin", {}, finished=False)
 
 
+@pytest.mark.parametrize("name", ["experiment", "scale", "config", "git"])
+def test_results_of_another_run_are_named(tmp_path, name):
+    directory = make_run(tmp_path, "20260101-000000")
+    own = {"experiment": "coin", "scale": "default", "config": {"steps": 9}, "git": "0123456789-dirty"}
+    write_json(directory / "results.json", FINISHED | own)
+    assert runs.read_run(directory).state == "finished"
+    write_json(directory / "results.json", FINISHED | own | {name: {"steps": 8} if name == "config" else "other"})
+    with pytest.raises(DamagedFileError, match=f"is of another run, with another {name}: put its own copy back"):
+        runs.read_run(directory)
+
+
+def test_a_file_in_a_part_of_a_run_names_the_run_and_the_part(tmp_path):
+    one, other = (make_run(tmp_path / n, "20260101-000000") for n in "ab")
+    write_json(other / "config.json", runs.read_description(other) | {"config": {"steps": 8}})
+    assert len({runs.labelled(run / part, "answers/sft-0") for run in (one, other) for part in ("", "x", "y")}) == 6
+    assert runs.labelled(tmp_path / "a" / "x", "sft/0") == runs.labelled(tmp_path / "b" / "x", "sft/0")  # of no run
+
+
 def test_a_run_is_named_by_path_stamp_or_experiment(tmp_path):
     directory = make_run(tmp_path, "20260101-000000")
     (tmp_path / "coin" / "latest").symlink_to(directory.name)

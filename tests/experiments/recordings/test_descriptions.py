@@ -1,5 +1,6 @@
 """Descriptions of videos: each of its own file, and of what the file holds now."""
 
+import json
 import os
 import shutil
 from pathlib import Path
@@ -7,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from experiments.core.errors import ConfigurationError
 from experiments.recordings import descriptions
-from experiments.recordings.descriptions import describe_files, families, videos_of
+from experiments.recordings.descriptions import describe_files, describe_source, families, videos_of
 from tests.sensors_io.importers.films import film, uneven_film
 
 
@@ -52,3 +54,21 @@ def test_videos_that_are_left_out_and_copies_are_named_before_anything_is_learne
     printed = context.console.file.getvalue()
     assert "left out: still.mp4 shows one picture in all of its 4 frames: a touch changes them; record" in printed
     assert "the same video of several objects, left in: press.avi, copy.avi\n" in printed
+
+
+def test_a_run_does_not_go_on_with_other_videos_labels_or_ratings(described, tmp_path, context):
+    levels = {"hardness": 0, "roughness": 1, "bumps": 2, "material": "wood"}
+    entry = {"object": "block", "name": "a block", "split": "train", **levels, "videos": ["press.mov"]}
+    video, table = write(tmp_path / "videos" / "press.mov", "1"), tmp_path / "labels.json"
+    changes = (
+        lambda: os.utime(write(video, "2"), ns=(0, 10**18)),
+        lambda: write(table, json.dumps({"objects": [entry | {"hardness": 2}]})),
+        lambda: write(tmp_path / "ratings.json", json.dumps({"objects": {"block": {"hardness": 7}}})),
+    )
+    for change in changes:
+        shutil.rmtree(context.directory / "stages", ignore_errors=True)  # a run of its own
+        write(table, json.dumps({"objects": [entry]}))
+        assert describe_source(tmp_path, 8, context).x[0, 0] == describe_source(tmp_path, 8, context).x[0, 0]
+        change()
+        with pytest.raises(ConfigurationError, match=r"videos, labels or ratings of .* changed since this run began"):
+            describe_source(tmp_path, 8, context)

@@ -2,12 +2,15 @@
 
 import os
 import resource
+import types
+import zlib
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax._src import compilation_cache as jax_cache
 from jax.experimental.compilation_cache import compilation_cache
 
 from touchr1_jax.training.compilation import (
@@ -57,6 +60,14 @@ def test_a_program_is_kept_and_found_again(keeping, tmp_path):
     assert kept
     assert {path.parts[0] for path in kept} == {processor()}
     assert entries(tmp_path) == kept
+
+
+def test_kept_programs_have_a_checksum_where_zstandard_is_installed(keeping, tmp_path, monkeypatch):
+    other = types.SimpleNamespace(ZstdCompressor=lambda: pytest.fail("its frames have no checksum"))
+    monkeypatch.setattr(jax_cache, "zstandard", other)
+    with compilations_kept(tmp_path):
+        assert zlib.decompress(jax_cache.compress_executable(b"program")) == b"program"
+    assert jax_cache.zstandard is other
 
 
 def test_nothing_is_kept_outside_the_block(keeping, tmp_path):
