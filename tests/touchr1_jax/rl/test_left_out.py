@@ -137,7 +137,8 @@ def test_an_optimizer_of_a_callers_own_never_receives_what_is_not_finite(bad):
     same = finite_update(OPTIMIZER, grads, optax.tree.norm(grads), before, PARAMS)
     jax.tree.map(np.testing.assert_array_equal, same, (PARAMS, before))
     guarded = skip_nonfinite(OPTIMIZER)
-    for own in (guarded, optax.MultiSteps(guarded, 2), optax.chain(optax.clip_by_global_norm(1.0), guarded)):
+    several = optax.MultiSteps(guarded, 2).gradient_transformation()
+    for own in (guarded, several, optax.chain(optax.clip_by_global_norm(1.0), guarded)):
         params, state = finite_update(own, grads, optax.tree.norm(grads), own.init(PARAMS), PARAMS)
         jax.tree.map(np.testing.assert_array_equal, params, PARAMS)
         assert count_skipped(state).tolist() == [1, 1]
