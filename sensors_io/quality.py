@@ -160,7 +160,7 @@ def oddities(
         "times that stand still": len(steps) > 0 and not steps.any(),
         "every frame flagged": bool(sequence.flags.all()),
     }
-    used = np.flatnonzero((sequence.flags & np.uint32(sum(rejected))) == 0)
+    used = np.flatnonzero((sequence.flags & np.uint32(sum(set(rejected)))) == 0)
     shown = sequence
     if 0 < len(used) < len(sequence):
         arrays = {name: getattr(sequence, name) for name in FRAME_ARRAYS}
@@ -174,9 +174,10 @@ def oddities(
         found["no change between pictures"] = not even and _stands_still(shown.frames)
     if shown.depth_mm is not None:
         found["no contact in any frame"] = bool(untouched(shown.depth_mm, shown.valid, config).all())
-    fields = [field for field in (shown.deformation_mm, shown.depth_mm) if field is not None]
+    fields = [field for field in (shown.deformation_mm, shown.shear_mm, shown.depth_mm) if field is not None]
     unread = shown.valid is not None and not shown.valid.any()
-    found["no change between fields"] = bool(fields) and (unread or all(map(_stands_still, fields)))
+    found["fields that are nowhere valid"] = unread
+    found["no change between fields"] = bool(fields) and not unread and all(map(_stands_still, fields))
     return tuple(name for name, holds in found.items() if holds)
 
 

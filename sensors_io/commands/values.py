@@ -10,7 +10,7 @@ from sensors_io.remote import at_url
 
 PORTS = 65_535
 
-_WRITTEN = ("out", "html")  # options that name what a command writes
+_WRITTEN = ("out", "html")  # options, also of `experiments`, that name what a command writes
 
 MOST = 1e15
 """Beyond it no quantity of an option lies in its unit, and a time in seconds no clock can hold."""

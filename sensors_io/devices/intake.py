@@ -266,7 +266,7 @@ class Intake:
         # a period takes back what it counted as missing, also one that is counted as broken by now
         counts.missing = max(0, counts.missing + step.missing - step.late - broken)
         if self._away:
-            counts.missing_away += step.missing
+            counts.missing_away += max(0, step.missing)
             self._away = False
         return False
 

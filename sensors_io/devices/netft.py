@@ -148,8 +148,8 @@ class _RateCheck:
         self._rate_hz = rate_hz
         self._first: tuple[int, int] | None = None  # number and arrival
         self._least: int | None = None  # of this quarter
-        self._usual: int | None = None  # the least since the last step
-        self._floor = self._step = 0  # the least ever, and the last step
+        self._usual: int | None = None  # the least after the last step
+        self._floor = self._step = 0  # the least after the first step and every step down, and the last step
         self._waited = 0  # datagrams that were waited for since the last judgement
         self._until_ns = 0
         self.measured_hz: float | None = None
@@ -180,7 +180,7 @@ class _RateCheck:
                 self.measured_hz = records * NS_PER_S / elapsed_ns
             self._usual, self._floor, self._step = self._least, min(self._least, self._floor), step
         elif self._usual - self._least > allowed_ns:
-            self._usual, self._step = self._least, 0
+            self._usual, self._step = self._floor, 0
         self._least, self._waited, self._until_ns = None, 0, arrival_ns + self._EVERY_NS
 
 
@@ -195,8 +195,8 @@ class NetFt:
         self._calibration: NetFtScale | None = None
         self._records: deque[tuple[int, bool, bytes]] = deque()
         self._rate = _RateCheck(config.rate_hz)
-        self._last: _Last | None = None
-        self._per_record = 0.0  # of the sensor's internal samples
+        self._first: _Numbered | None = None  # record of the stream
+        self._last: _Numbered | None = None
         self._reopened = False  # since the last record
 
     @property
@@ -236,7 +236,7 @@ class NetFt:
             self._receive(timeout_s)
         stamp_ns, waited, record = self._records.popleft()
         told, internal, status, *counts = RECORD.unpack(record)
-        number = self._number(told, internal, stamp_ns)
+        number, *_, began_ns = self._number(told, internal, stamp_ns)
         if status & _STATUS_ERROR and not status & _STATUS_RANGE:
             raise DeviceDataError(f"NetFT record {told} has status {status:#010x}: {_meaning(status)}")
         assert self._calibration is not None
@@ -245,7 +245,7 @@ class NetFt:
         timed = self._rate.measured_hz is None
         return Sample(
             host_time_ns=stamp_ns,
-            device_time_ns=round(number * NS_PER_S / self._config.rate_hz) if timed else None,
+            device_time_ns=began_ns + round(number * NS_PER_S / self._config.rate_hz) if timed else None,
             index=number,
             arrays={
                 "force_n": (values[:3] / self._calibration.counts_per_n).astype(np.float32),
@@ -258,26 +258,40 @@ class NetFt:
         """Make the sensor take its present load as zero; only `force-zero` leaves a trace in the records."""
         self._command(Command.BIAS)
 
-    def _number(self, told: int, internal: int, stamp_ns: int) -> int:
-        """Number of a record, which goes on where the sensor's runs around or begins anew.
+    def _number(self, told: int, internal: int, stamp_ns: int) -> "_Numbered":
+        """The record, whose number goes on where the sensor's runs around.
 
-        A sensor numbers the records of every stream anew, its internal samples as long as it has power: then it cannot
-        have taken more than there was time for.
+        A sensor numbers the records of every stream anew, its internal samples as long as it has power.  Where they go
+        on over a reopening, so does the number; otherwise number and clock begin anew.
         """
-        last, steps = self._last, 0
-        if last is not None and not self._reopened:
-            steps = _signed(told - last.told)
-            self._per_record = _signed(internal - last.internal) / steps if steps else self._per_record
-        elif last is not None and self._per_record > 0:
-            taken = round(_signed(internal - last.internal) / self._per_record)
-            there_was_time = taken * NS_PER_S / self._config.rate_hz < stamp_ns - last.stamp_ns + HELD_NS
-            steps = max(0, taken) if there_was_time else 0
-        if last is None or (self._reopened and not steps):
-            self._rate, number = _RateCheck(self._config.rate_hz), told
-        else:
-            number = last.number + steps
-        self._last, self._reopened = _Last(number, told, internal, stamp_ns), False
-        return number
+        last, reopened = self._last, self._reopened
+        began_ns, number = 0, told
+        if last is not None:
+            steps = self._taken(last, internal, stamp_ns) if reopened else _signed(told - last.told)
+            if steps is None:
+                period_ns = NS_PER_S / self._config.rate_hz
+                began_ns = last.began_ns + stamp_ns - last.stamp_ns + round((last.number - told) * period_ns)
+            else:
+                began_ns, number = last.began_ns, last.number + steps
+            if reopened and (steps is None or self._rate.measured_hz is not None):
+                self._rate = _RateCheck(self._config.rate_hz)
+        found = _Numbered(number, told, internal, stamp_ns, began_ns)
+        self._first = found if self._first is None or reopened else self._first
+        self._last, self._reopened = found, False
+        return found
+
+    def _taken(self, last: "_Numbered", internal: int, stamp_ns: int) -> int | None:
+        """Records that the sensor took since the last one of the stream before; `None` if it lost power or cannot tell.
+
+        Internal samples count them at that stream's ratio, which is no whole number, over no longer than it lasted.
+        """
+        assert self._first is not None
+        span, gap = _signed(last.internal - self._first.internal), _signed(internal - last.internal)
+        if not 0 < gap <= span:
+            return None
+        taken = max(1, round(gap * (last.number - self._first.number) / span))
+        late_ns = stamp_ns - last.stamp_ns - taken * NS_PER_S / self._config.rate_hz
+        return taken if abs(late_ns) < HELD_NS else None
 
     def _check_rate(self, number: int, stamp_ns: int, waited: bool) -> None:
         """Warn once of a wrong rate; from then on a record has the time of its arrival alone."""
@@ -342,13 +356,14 @@ class NetFt:
             self._socket = None
 
 
-class _Last(NamedTuple):
-    """The last record: its number, the numbers that the sensor told of it and of its internal sample, its arrival."""
+class _Numbered(NamedTuple):
+    """Number of a record, what the sensor told of it and of its internal sample, its arrival, the time of number 0."""
 
     number: int
     told: int
     internal: int
     stamp_ns: int
+    began_ns: int
 
 
 def _signed(difference: int) -> int:

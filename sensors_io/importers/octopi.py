@@ -48,7 +48,9 @@ def list_octopi(source: pathlib.Path, config: Keep) -> Catalogue:
       ImportSourceError: no sample there.
     """
     found = [path for path in inside(source) if path.parent.parent == source]
-    samples = sorted((path for path in found if path.name == "data.json"), key=lambda path: natural(path.parent))
+    samples = sorted(
+        (path for path in found if path.name == "data.json" and path.is_file()), key=lambda path: natural(path.parent)
+    )
     require_files(source, samples, "<sample>/data.json and <sample>/tactile/*.jpg")
     cards: dict[str, ObjectCard] = {}
     contacts, trials = [], Counter[tuple[str, str]]()

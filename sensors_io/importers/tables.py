@@ -3,16 +3,19 @@
 import csv
 import pathlib
 from collections.abc import Sequence as Seq
+from typing import TypeVar
 
 from sensors_io.importers.keep import ImportSourceError
 from sensors_io.json_files import require_regular
+
+Row = TypeVar("Row", dict[str, str], list[str])
 
 
 def read_table(path: pathlib.Path, columns: Seq[str]) -> list[dict[str, str]]:
     """Rows of a table by column; a short row has empty cells.
 
     Raises:
-      ImportSourceError: it is absent, is no text, or lacks a column.
+      ImportSourceError: it is absent, is no text, lacks a column, or has no row.
     """
     _require_file(path)
     try:
@@ -24,7 +27,7 @@ def read_table(path: pathlib.Path, columns: Seq[str]) -> list[dict[str, str]]:
                     f"{path} has the columns {reader.fieldnames}: must have {', '.join(columns)}; "
                     "give the published table"
                 )
-            return list(reader)
+            return _with_a_row(path, list(reader))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ImportSourceError(f"{path} cannot be read ({error}); give the published table") from error
 
@@ -38,9 +41,12 @@ def read_rows(path: pathlib.Path) -> list[list[str]]:
     _require_file(path)
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            rows = [row for row in csv.reader(file) if row]
+            return _with_a_row(path, [row for row in csv.reader(file) if row])
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ImportSourceError(f"{path} cannot be read ({error}); give the published table") from error
+
+
+def _with_a_row(path: pathlib.Path, rows: list[Row]) -> list[Row]:
     if not rows:
         raise ImportSourceError(f"{path} is empty: must have a row; give the published table")
     return rows

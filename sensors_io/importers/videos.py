@@ -123,7 +123,8 @@ def _clips(source: pathlib.Path) -> list[pathlib.Path]:
     """Videos and folders of pictures, the folder itself last, in the order of the numbers in their names."""
     if not source.is_dir():
         return []
-    found = sorted(inside(source), key=lambda path: (natural(path.parent.relative_to(source)), natural(path)))
+    parts = lambda path: [natural(part) for part in (*reversed(path.parents), path)]
+    found = sorted(inside(source), key=lambda path: (parts(path.parent.relative_to(source)), natural(path)))
     return [p for p in (*found, source) if (p.is_file() and p.suffix.lower() in SUFFIXES) or numbered(p)]
 
 

@@ -117,18 +117,13 @@ class Coach:
         return self._phase != Phase.APPROACH or self._tapped > 0 or self._done
 
     def step(self, time_ns: int, force_n: np.ndarray) -> Advice:
-        """Take one force [3] on the gel into account; one that is not finite is none, and changes nothing.
-
-        One that a later force overtook is shown, but leads to no other phase.
-        """
-        if np.isfinite(force_n).all():
-            self._normal = -float(force_n[2])
-            if time_ns >= self._newest_ns:
-                self._newest_ns = time_ns
-                if not self._armed:
-                    self._arm(time_ns, self._normal)
-                elif not self._done:
-                    self._advance(time_ns, self._normal)
+        """Take one force [3] on the gel into account; one that is not finite, or that a later one overtook, is none."""
+        if np.isfinite(force_n).all() and time_ns >= self._newest_ns:
+            self._normal, self._newest_ns = -float(force_n[2]), time_ns
+            if not self._armed:
+                self._arm(time_ns, self._normal)
+            elif not self._done:
+                self._advance(time_ns, self._normal)
         return Advice(
             prompt=self._prompt(self._normal),
             phase=self._phase,

@@ -71,13 +71,17 @@ def test_odd_but_legal_sequences_are_named() -> None:
         assert quality.oddities(dataclasses.replace(whole, **changes)) == expected
     dark, used = np.arange(3) < 2, {Flag.SATURATED, Flag.NOT_CONVERGED}
     black = {"frames": np.where(dark[:, None, None, None], 0, pictures), "flags": np.uint32([8, 0, 4])}
-    assert quality.oddities(dataclasses.replace(whole, **black), rejected=used) == ("all pictures black",)
+    assert quality.oddities(dataclasses.replace(whole, **black), rejected=[*used, Flag.SATURATED]) == (
+        "all pictures black",
+    )
     assert quality.oddities(dataclasses.replace(whole, flags=np.uint32([2, 8, 4])), rejected=used) == (
         "every frame flagged",
         "one frame",
     )
     hidden = {"deformation_mm": np.float32(pictures[..., :2]), "valid": np.zeros((3, 4, 4), bool)}
-    assert quality.oddities(dataclasses.replace(whole, **hidden)) == ("no change between fields",)
+    assert quality.oddities(dataclasses.replace(whole, **hidden)) == ("fields that are nowhere valid",)
+    sheared = {"deformation_mm": np.ones((3, 4, 4, 2), np.float32), "shear_mm": np.float32(pictures[..., :2])}
+    assert not quality.oddities(dataclasses.replace(whole, **sheared))
     one = {name: getattr(whole, name)[:1] for name in ("frames", "host_time_ns", "phase", "flags")}
     assert quality.oddities(dataclasses.replace(whole, **one)) == ("one frame",)
 

@@ -5,6 +5,7 @@ import shutil
 import pytest
 
 from sensors_io.importers.keep import ImportSourceError
+from sensors_io.importers.tables import read_table
 from sensors_io.importers.tacquad import list_tacquad
 from tests.sensors_io.checks import refused
 from tests.sensors_io.importers.films import EVERYTHING, imported, picture
@@ -63,6 +64,8 @@ def test_a_part_without_its_table_is_named(source):
     table = source / "contact_indoor.csv"
     rows, _ = table.read_text(), table.write_text("")
     refused(ImportSourceError, "contact_indoor.csv is empty", list_tacquad, source, EVERYTHING)
+    table.write_text("number,tactile\n")
+    refused(ImportSourceError, "contact_indoor.csv is empty", read_table, table, ["number"])
     table.write_text(rows)
     (source / "contact_fine.csv").unlink()
     assert [skip.name for skip in list_tacquad(source, EVERYTHING).skipped] == ["data_fine"]

@@ -146,3 +146,13 @@ def test_clips_whose_names_no_key_can_have_are_different_objects(tmp_path):
     table = "clip,hardness,split\nmu\u0308,2,unlabelled\n"  # an accent of its own, as macOS writes it
     (found,) = listed(tmp_path, table).cards.values()
     assert (found.object_id, found.split) == ("m", "unlabelled")
+
+
+def test_a_folder_is_read_before_the_next(tmp_path):
+    """Also where folders in them have the same name."""
+    places = ["cup/1/a.avi", "cup/1/b.avi", "mug/1/a.avi", "mug/2/a.avi", "mug/10/a.avi"]
+    for place in reversed(places):
+        (tmp_path / "clips" / place).parent.mkdir(parents=True, exist_ok=True)
+        film(tmp_path / "clips" / place, frames=3)
+    found = listed(tmp_path / "clips", "\n".join(["clip", *places]))
+    assert [contact.name for contact in found.contacts] == places

@@ -53,6 +53,7 @@ def test_a_force_from_before_the_touch_that_comes_late_is_no_letting_go():
     forces = [(0, 0), (50, 0), (100, 0), (150, 0), (200, 5), (180, 0), (250, 10), (300, 20)]
     advice = [coach.step(ms * 1_000_000, np.array([0, 0, -n])) for ms, n in forces]
     assert [a.done for a in advice] == [False] * 7 + [True]
+    assert advice[5].normal_n == 5  # what is shown does not go back either
     assert advice[-1].complete
 
 
