@@ -57,7 +57,7 @@ def stage_hooks(
     better: Literal["higher"] | None = "higher" if scored else None
     seal_log = functools.partial(context.seal_log, stage)
     with (
-        Checkpoints(folder, KEPT, better=better, print_=context.print, of=of, saved=seal_log) as checkpoints,
+        Checkpoints(folder, KEPT, better=better, print_=context.print, of=of, before_save=seal_log) as checkpoints,
         context.timed(stage),
         context.stopping.patient(context.processes.any) as stopping,
         context.compiling(stage.rpartition("/")[0]) as compiled,  # all seeds run one program
