@@ -14,6 +14,7 @@ import functools
 import hashlib
 import importlib.metadata
 import json
+import operator
 import os
 import platform
 import shlex
@@ -204,10 +205,11 @@ def labelled(directory: Path, name: str) -> str:
     run, such as a part of it, by the run too.
     """
     about: Any = directory.name
-    run = directory if (directory / "config.json").exists() else directory.parent
-    if (run / "config.json").exists():
-        about = [read_description(run)[field] for field in ("experiment", "config")]
-        about += [] if run == directory else [directory.name]
+    kind, above = operator.itemgetter("experiment", "config"), directory.parent / "config.json"
+    if (directory / "config.json").exists():
+        about = kind(read_description(directory))
+    elif above.exists() and _describes_run(found := read_json(above)):
+        about = [*kind(found), directory.name]
     return f"{name} {hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:8]}"
 
 
