@@ -37,7 +37,7 @@ from touchr1_jax.training.compilation import drop_programs
 
 T = TypeVar("T")
 
-_LOGGED = "logged"  # folder in `stages` for what `Context.ended` keeps
+_LOGGED = "logged"  # folder in `stages` for what `Context.seal_log` keeps
 
 _STAGE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*(?:/[A-Za-z0-9_][A-Za-z0-9_.\-]*)*")
 
