@@ -56,10 +56,10 @@ class MetricLog:
         return found
 
     def summary_of(self, stage: str) -> list[int]:
-        """`summary` of the lines of a stage, which are on the disk then."""
+        """`summary` of the lines of a stage of this session, which are on the disk then."""
         with self._lock, self._named():
             os.fsync(self._file.fileno())
-            return self._sums[stage] if stage in self._sums else summary(self.by_stage().get(stage, []))
+            return self._sums[stage]
 
     def _replace(self, lines: list[str], by: list[str]) -> None:
         if lines != by:
