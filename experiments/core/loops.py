@@ -90,7 +90,6 @@ def stage_hooks(
         )
         bar.close()
         _tell(context, stage, times, max(left_out))
-    seal_log()
 
 
 def _tell(context: Context, stage: str, times: LoopTime, left_out: float) -> None:
