@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Literal
 
 from experiments.core.context import Context
+from experiments.core.metric_log import by_stage
 from experiments.core.progress import TrainingSample
 from experiments.core.results import Table, named_table
 from experiments.core.runs import labelled
@@ -101,14 +102,6 @@ def _tell(context: Context, stage: str, times: LoopTime, left_out: float) -> Non
         context.add_time(f"{WAITING}/{stage}", times.input_s)
         ms = 1e3 * times.total_s / times.steps
         context.print(f"{stage}: {ms:.3g} ms a step, {times.input_share:.2%} of it {WAITING}")
-
-
-def by_stage(lines: Iterable[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
-    """The lines of `metrics.jsonl` of each stage."""
-    stages: dict[str, list[Mapping[str, Any]]] = {}
-    for line in lines:
-        stages.setdefault(line["stage"], []).append(line)
-    return stages
 
 
 def fired_alarms(lines: Iterable[Mapping[str, Any]]) -> dict[str, list[int]]:
