@@ -29,8 +29,8 @@ from experiments.active.world import TouchWorld, WorldConfig, make_world
 from experiments.core.concurrency import concurrently
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
-from experiments.core.loops import by_stage, fired_alarms
-from experiments.core.metric_log import read_metrics
+from experiments.core.loops import fired_alarms
+from experiments.core.metric_log import by_stage, read_metrics
 from experiments.core.results import Requirement, Results, Table, at_least, named_table
 from experiments.core.runner import Experiment
 from experiments.study.training import preset_name

@@ -19,7 +19,7 @@ from rich.table import Table
 
 from experiments.bench.contacts import measure_split, read_source
 from experiments.bench.score_units import score_units
-from experiments.core.artifacts import DamagedFileError, read_json, write_json
+from experiments.core.artifacts import DamagedFileError, fitting, read_json, write_json
 from experiments.core.text import number
 from sensors_io.commands.console import complain, print_in_any_encoding, progress_bar
 from sensors_io.commands.values import require_possible
@@ -128,15 +128,17 @@ class Score:
         tuple(finish([unit for unit, _ in units.values()], self.launcher, OUT.print))
         for path, (_, scores) in units.items():
             table, found = Table("metric", "", "95 %, over objects", "values", "meaning"), read_json(scores)
-            if found.get("of", scores.stem) != scores.stem:
-                raise DamagedFileError(
-                    f"{scores} holds the scores of {found['of']}: put its own copy back, or remove it"
-                )
-            for name, row in found["rows"].items():
-                metric = BENCH_METRICS[name]
-                mean, low, high = (format(row[end], metric.format) for end in ("mean", "low", "high"))
-                table.add_row(metric.title, mean, f"{low} – {high}", str(row["values"]), metric.meaning)
-            OUT.print(*([path] if len(units) > 1 else []), table, found["said"], sep="\n")
+            with fitting(scores):
+                if found.get("of", scores.stem) != scores.stem:
+                    raise DamagedFileError(
+                        f"{scores} holds the scores of {found['of']}: put its own copy back, or remove it"
+                    )
+                for name, row in found["rows"].items():
+                    metric = BENCH_METRICS[name]
+                    mean, low, high = (format(row[end], metric.format) for end in ("mean", "low", "high"))
+                    table.add_row(metric.title, mean, f"{low} – {high}", str(row["values"]), metric.meaning)
+                said = found["said"]
+            OUT.print(*([path] if len(units) > 1 else []), table, said, sep="\n")
         return 0
 
 

@@ -26,7 +26,7 @@ from experiments.core.artifacts import (
     write_sealed,
 )
 from experiments.core.errors import ConfigurationError
-from experiments.core.metric_log import MetricLog, damaged_log, read_metrics, summary
+from experiments.core.metric_log import MetricLog, by_stage, damaged_log, read_metrics, summary
 from experiments.core.progress import Advance, Loop, ProgressCallback, TrainingSample, Watcher, show_progress
 from experiments.core.runs import labelled
 from experiments.core.stopping import Stopping
@@ -37,7 +37,7 @@ from touchr1_jax.training.compilation import drop_programs
 
 T = TypeVar("T")
 
-_LOGGED = "logged"  # folder in `stages` for what `Context.ended` keeps
+_LOGGED = "logged"  # folder in `stages` for what `Context.seal_log` keeps
 
 _STAGE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*(?:/[A-Za-z0-9_][A-Za-z0-9_.\-]*)*")
 
@@ -125,7 +125,7 @@ class Context:
         folder = self.directory / "stages" / _LOGGED
         if self._log is None:
             return
-        lines = self._log.by_stage()
+        lines = self._log.lines_of_stages()
         for path in sorted(folder.rglob("*.json")):
             stage, kept = path.relative_to(folder).with_suffix("").as_posix(), read_json(path)
             with fitting(path):
@@ -219,7 +219,7 @@ class Context:
         """`DamagedFileError` unless the log has every step before a checkpoint: no run ends with a part of it."""
         if steps == 0 or not self.processes.writes:
             return
-        seen = {row["step"] for row in read_metrics(self.directory) if row["stage"] == stage}
+        seen = {row["step"] for row in by_stage(read_metrics(self.directory)).get(stage, ())}
         missing = sorted(set(range(steps)) - seen)
         if missing:
             how = f"of stage {stage} {len(missing)} of {steps} steps are missing, the first is {missing[0]}"

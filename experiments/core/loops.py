@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Literal
 
 from experiments.core.context import Context
+from experiments.core.metric_log import by_stage
 from experiments.core.progress import TrainingSample
 from experiments.core.results import Table, named_table
 from experiments.core.runs import labelled
@@ -57,7 +58,7 @@ def stage_hooks(
     better: Literal["higher"] | None = "higher" if scored else None
     seal_log = functools.partial(context.seal_log, stage)
     with (
-        Checkpoints(folder, KEPT, better=better, print_=context.print, of=of, saved=seal_log) as checkpoints,
+        Checkpoints(folder, KEPT, better=better, print_=context.print, of=of, before_save=seal_log) as checkpoints,
         context.timed(stage),
         context.stopping.patient(context.processes.any) as stopping,
         context.compiling(stage.rpartition("/")[0]) as compiled,  # all seeds run one program
@@ -90,7 +91,6 @@ def stage_hooks(
         )
         bar.close()
         _tell(context, stage, times, max(left_out))
-    seal_log()
 
 
 def _tell(context: Context, stage: str, times: LoopTime, left_out: float) -> None:
@@ -102,14 +102,6 @@ def _tell(context: Context, stage: str, times: LoopTime, left_out: float) -> Non
         context.add_time(f"{WAITING}/{stage}", times.input_s)
         ms = 1e3 * times.total_s / times.steps
         context.print(f"{stage}: {ms:.3g} ms a step, {times.input_share:.2%} of it {WAITING}")
-
-
-def by_stage(lines: Iterable[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
-    """The lines of `metrics.jsonl` of each stage."""
-    stages: dict[str, list[Mapping[str, Any]]] = {}
-    for line in lines:
-        stages.setdefault(line["stage"], []).append(line)
-    return stages
 
 
 def fired_alarms(lines: Iterable[Mapping[str, Any]]) -> dict[str, list[int]]:

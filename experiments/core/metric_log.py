@@ -6,7 +6,7 @@ import os
 import threading
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,8 +46,8 @@ class MetricLog:
             lines = _whole_lines(self._path)
             self._replace(lines, sorted(lines, key=lambda line: _seed(_row(line, self._path)["stage"])))
 
-    def by_stage(self) -> dict[str, list[str]]:
-        """The lines of each stage, in order."""
+    def lines_of_stages(self) -> dict[str, list[str]]:
+        """The lines of each stage, in order and as they stand in the file."""
         with self._lock:
             lines = _whole_lines(self._path)
         found: dict[str, list[str]] = {}
@@ -56,10 +56,10 @@ class MetricLog:
         return found
 
     def summary_of(self, stage: str) -> list[int]:
-        """`summary` of the lines of a stage, which are on the disk then."""
+        """`summary` of the lines of a stage of this session, which are on the disk then."""
         with self._lock, self._named():
             os.fsync(self._file.fileno())
-            return self._sums[stage] if stage in self._sums else summary(self.by_stage().get(stage, []))
+            return self._sums[stage]
 
     def _replace(self, lines: list[str], by: list[str]) -> None:
         if lines != by:
@@ -120,6 +120,14 @@ def summary(lines: Sequence[str]) -> list[int]:
 def read_metrics(directory: Path) -> list[dict[str, Any]]:
     """The logged lines of a run, in order."""
     return _rows(directory / "metrics.jsonl")
+
+
+def by_stage(rows: Iterable[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
+    """The rows of `metrics.jsonl` of each stage, in order."""
+    stages: dict[str, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        stages.setdefault(row["stage"], []).append(row)
+    return stages
 
 
 def _rows(path: Path) -> list[dict[str, Any]]:

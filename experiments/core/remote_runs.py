@@ -20,6 +20,7 @@ from touchr1_jax.training.checksums import CHECKSUMS
 EVERY_S = 60.0  # between two copies: what a machine computed in the last minute before it is lost is computed again
 
 RESULTS = "results.json"
+_SEALS = "stages/logged/"  # of the log; one of another moment than the copied log would not hold of it
 _HALF = ".orbax-checkpoint-tmp"  # in the name of a checkpoint that is being written
 _LOG = logging.getLogger(__name__)
 
@@ -67,7 +68,8 @@ class _Copier:
         for name in files:
             run, _, inside = name.partition("/")
             whole = not inside.startswith("checkpoints/") or name.startswith(signed)
-            if run not in (*finished, LATEST) and whole:  # an upload may have followed the link
+            elsewhere = run in (*finished, LATEST)  # an upload may have followed the link
+            if whole and not elsewhere and not inside.startswith(_SEALS):
                 (path := self._folder / name).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(self._remote.fetch(name), path)
         self._sent = {name: _state(path) for name, path in self._files().items()}
@@ -112,13 +114,14 @@ class _Copier:
         self._sent |= {name: states[name] for name in kept}
 
     def _files(self) -> dict[str, Path]:
-        """The files of all runs, without locks, the link to the latest run and what is half-written."""
+        """The files of all runs, without locks, the link to the latest run, seals and what is half-written."""
         found = dict[str, Path]()
         for run in (path for path in self._folder.glob("*") if not path.is_symlink()):
             # `rglob` fails where a folder is renamed or removed meanwhile, as those of checkpoints are
             for path in (Path(folder, file) for folder, _, files in os.walk(run) for file in files):
                 name = path.relative_to(self._folder).as_posix()
-                if path.is_file() and not any(part[0] == "." or _HALF in part for part in name.split("/")):
+                left_out = any(part[0] == "." or _HALF in part for part in name.split("/"))
+                if path.is_file() and not left_out and not name.partition("/")[2].startswith(_SEALS):
                     found[name] = path
         return found
 

@@ -14,6 +14,7 @@ import functools
 import hashlib
 import importlib.metadata
 import json
+import operator
 import os
 import platform
 import shlex
@@ -204,10 +205,11 @@ def labelled(directory: Path, name: str) -> str:
     run, such as a part of it, by the run too.
     """
     about: Any = directory.name
-    run = directory if (directory / "config.json").exists() else directory.parent
-    if (run / "config.json").exists():
-        about = [read_description(run)[field] for field in ("experiment", "config")]
-        about += [] if run == directory else [directory.name]
+    kind, above = operator.itemgetter("experiment", "config"), directory.parent / "config.json"
+    if (directory / "config.json").exists():
+        about = kind(read_description(directory))
+    elif above.exists() and _describes_run(found := read_json(above)):
+        about = [*kind(found), directory.name]
     return f"{name} {hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:8]}"
 
 
@@ -281,7 +283,7 @@ def read_run(directory: Path) -> PastRun:
         directory=directory,
         description=description,
         seconds=_object(times).get("total") if times.exists() else None,  # stages come before the total
-        results=_results(results, description) if results.exists() else None,
+        results=read_results(results, description) if results.exists() else None,
         in_use=_in_use(directory),
     )
     with fitting(times):  # what `list` shows is made once here, so that a file of another shape is named at once
@@ -291,11 +293,12 @@ def read_run(directory: Path) -> PastRun:
     return run
 
 
-def _results(path: Path, description: Mapping[str, Any]) -> dict[str, Any]:
+def read_results(path: Path, description: Mapping[str, Any]) -> dict[str, Any]:
     """The content of `results.json`; `DamagedFileError` if it is damaged, or of another run than its `config.json`."""
-    found, git = _object(path, "verdict"), str(Revision(**description["git"]))
-    own = {"git": git, **{name: description[name] for name in ("experiment", "scale", "config")}}
-    if other := [name for name, value in own.items() if found.get(name, value) != value]:
+    found, git = _object(path, "verdict"), description.get("git")
+    own = dict(description) | ({"git": str(Revision(**git))} if git else {})
+    about = [name for name in ("git", "experiment", "scale", "config") if name in own]
+    if other := [name for name in about if found.get(name, own[name]) != own[name]]:
         raise DamagedFileError(
             f"{path} is of another run, with another {', '.join(other)}: put its own copy back, or move it away and "
             "continue the run"

@@ -9,8 +9,8 @@ import numpy as np
 from experiments.core.charts import Panel, Rule, Series, draw, estimates
 from experiments.core.context import Context
 from experiments.core.look import PALETTE, SHARED
-from experiments.core.loops import ALARM, by_stage, fired_alarms
-from experiments.core.metric_log import read_metrics
+from experiments.core.loops import ALARM, fired_alarms
+from experiments.core.metric_log import by_stage, read_metrics
 from experiments.core.results import Estimate, Picture, Results, Table, named_table
 from experiments.core.text import bounds, interval, number
 from experiments.study.ablation import Ablation, run_ablation

@@ -20,7 +20,7 @@ from flax import traverse_util
 from experiments.core import numerics
 from experiments.core.artifacts import jsonable, read_arrays, write_arrays
 from experiments.core.context import Context
-from experiments.core.metric_log import read_metrics
+from experiments.core.metric_log import by_stage, read_metrics
 from experiments.core.runs import ROOT, versions
 from touchr1_jax.types import Params
 
@@ -137,5 +137,5 @@ def _found(path: Path, context: Context, stage: str) -> Params:
 
 def _logged(context: Context, stage: str) -> list[dict[str, Any]]:
     """The logged lines of a stage without its name."""
-    lines = (line for line in read_metrics(context.directory) if line["stage"] == stage)
+    lines = by_stage(read_metrics(context.directory)).get(stage, ())
     return [{name: value for name, value in line.items() if name != "stage"} for line in lines]

@@ -87,7 +87,7 @@ def compare_rows(
     for metric in metrics:
         if metric in scored[a][0] and metric in scored[b][0]:
             ours, theirs = ([scores[metric] for scores in scored[name]] for name in (a, b))
-            theirs = theirs * (len(ours) // len(theirs))
+            theirs = theirs * len(ours) if len(theirs) == 1 else theirs
             found.append(compare_over_objects(metric, a, b, ours, theirs, objects))
             if len(ours) > 1:
                 found.append(compare_over_seeds(metric, a, b, *([s.mean() for s in row] for row in (ours, theirs))))
@@ -99,8 +99,7 @@ def compare_over_seeds(metric: str, arm: str, against: str, a: Sequence[float], 
 
     The last is `None` for a metric that has no better direction; a and b are the value of every seed.
     """
-    counts = len(a), len(b)
-    require(counts[0] == counts[1], f"{arm} and {against}", counts, "must have the same seeds", "run the missing ones")
+    _require_same_seeds(arm, against, a, b)
     difference = np.subtract(a, b)
     interval = statistics.student_interval(difference)
     better = REPORTED[metric].better
@@ -125,6 +124,7 @@ def compare_over_objects(
 
     A baseline without seeds is repeated by the caller.
     """
+    _require_same_seeds(arm, against, a, b)
     for x, y in zip(a, b, strict=True):
         same = np.array_equal(x.items, y.items) and np.array_equal(x.strata, y.strata)
         require(same, metric, f"{arm} and {against}", "must be scored on the same answers", "align the questions")
@@ -139,3 +139,8 @@ def compare_over_objects(
         over="objects",
         n=len(np.unique(objects[a[0].items])),
     )
+
+
+def _require_same_seeds(arm: str, against: str, a: Sequence[object], b: Sequence[object]) -> None:
+    counts = len(a), len(b)
+    require(counts[0] == counts[1], f"{arm} and {against}", counts, "must have the same seeds", "run the missing ones")

@@ -96,11 +96,10 @@ def find_policy(name: str, runs_dir: Path, weights: Path | None = None) -> Askab
 def measured_figures(name: str, runs_dir: Path) -> dict[str, str]:
     """Scores of a run's policy on unseen objects, for its model card; empty for other policies and unfinished runs."""
     folder = run_policy(name, runs_dir)
-    results = None if folder is None else runs.read_run(folder.parents[2]).results
-    if folder is None or results is None:
+    if folder is None or not runs.is_finished(run := folder.parents[2]):
         return {}
-    with fitting(folder.parents[2] / "results.json"):
-        return _measured(results, folder.parent.name)
+    with fitting(results := run / "results.json"):  # `config.json` of an earlier version may lack a field
+        return _measured(runs.read_results(results, read_json(run / "config.json")), folder.parent.name)
 
 
 def _measured(found: Any, arm: str) -> dict[str, str]:

@@ -84,7 +84,7 @@ class Checkpoints:
       print_: receives a line about each damaged checkpoint that is skipped; standard error by default.
       of: what the checkpoints say that they are of; those of something else, or of another step, count as damaged.
         Without it all are read.
-      saved: called after each checkpoint that `save` begins to write.
+      before_save: called before each checkpoint is written; where it raises, none is.
 
     Raises:
       CheckpointError: the directory cannot be read or written.
@@ -98,12 +98,12 @@ class Checkpoints:
         better: Literal["higher", "lower"] | None = None,
         print_: Callable[[str], None] = _complain,
         of: str = "",
-        saved: Callable[[], object] = lambda: None,
+        before_save: Callable[[], object] = lambda: None,
     ) -> None:
         if keep < 1:
             raise ValueError(f"keep is {keep}: must be at least 1; raise it")
         self._directory, self._better, self._print, self._of = directory.absolute(), better, print_, of
-        self._saved = saved
+        self._before_save = before_save
         self._saving: int | None = None
         self._best: tuple[int, float] | None = None
         policy = LatestN(keep)
@@ -167,6 +167,7 @@ class Checkpoints:
             state=ocp.args.StandardSave(state), data=ocp.args.JsonSave(held | {"crc32": _crc32(held)})
         )
         others = threading.current_thread() is not threading.main_thread()
+        self._before_save()
         try:
             self._manager.wait_until_finished()
             self._saving = step
@@ -176,7 +177,6 @@ class Checkpoints:
                     self._manager.wait_until_finished()
         except _FAILURES as error:
             raise self._unsaved(error) from error
-        self._saved()
 
     def latest(self) -> int | None:
         """Step of the newest checkpoint, intact or not."""

@@ -19,9 +19,10 @@ import pytest
 from experiments.ask.command import run_asking
 from experiments.ask.demo import demo_server
 from experiments.ask.inputs import read_touch
+from experiments.core.artifacts import DamagedFileError
 from experiments.core.errors import DataError
 from experiments.core.runs import FIELDS, ROOT
-from experiments.study.policies import find_policy, is_policy, publish_policy
+from experiments.study.policies import find_policy, is_policy, measured_figures, publish_policy
 from experiments.study.stages import encode_rows
 from sensors_io.commands.console import print_in_any_encoding
 from sensors_io.remote import CACHE
@@ -262,6 +263,17 @@ def test_a_damaged_result_is_named_where_its_card_is_written(runs, tmp_path, cap
         assert run_asking(["export", "trial", str(tmp_path / "p"), "--runs-dir", str(runs)]) == 1
         assert "results.json is not that of a run" in capsys.readouterr().err
     results.write_text(before)
+
+
+def test_a_card_takes_the_figures_of_a_run_of_an_earlier_version_and_of_no_other(runs, tmp_path):
+    (tmp_path / "policies" / "sft" / "0").mkdir(parents=True)
+    found = json.loads((runs / "trial" / "latest" / "results.json").read_text())
+    (tmp_path / "results.json").write_text(json.dumps(found | {"config": {"steps": 9}}))
+    (tmp_path / "config.json").write_text(json.dumps({"experiment": "trial", "config": {"steps": 9}}))
+    assert "on 5 unseen objects" in measured_figures(str(tmp_path), runs)["measured"]
+    (tmp_path / "config.json").write_text(json.dumps({"experiment": "trial", "config": {"steps": 8}}))
+    with pytest.raises(DamagedFileError, match="is of another run, with another config"):
+        measured_figures(str(tmp_path), runs)
 
 
 @pytest.mark.long

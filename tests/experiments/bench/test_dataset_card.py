@@ -91,6 +91,10 @@ def test_anybody_is_scored(directory, tmp_path, capsys, monkeypatch):
     one.write_bytes(other.read_bytes())
     assert main(score) == 1
     assert f"holds the scores of {other.stem}: put its own copy back, or remove it" in capsys.readouterr().err
+    for text in ("[]", "{}", '{"rows": {"acc": {}}}', '{"rows": {}}', '{"rows": {"none": {}}, "said": ""}'):
+        one.write_text(text)
+        assert main(score) == 1
+        assert f"{one} is not that of a run" in capsys.readouterr().err
     assert main([*score[:-1], str(said)]) == 1
     assert f"cache-dir is {said}: must be a folder" in capsys.readouterr().err
     write_lines(said, [{"id": "nobody", "text": "?"}])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experiments.core.errors import ResultsError
-from experiments.study.estimates import compare_over_objects, compare_over_seeds, estimate, pooled
+from experiments.study.estimates import compare_over_objects, compare_over_seeds, compare_rows, estimate, pooled
 from touchr1_jax.bench.metrics import accuracy, ordinal_mae
 
 OBJECTS = np.array(["a", "a", "b"])
@@ -38,6 +38,16 @@ def test_comparison_over_seeds_by_hand():
     assert compare_over_seeds("middle_rate", "a", "b", a, b).improvement is None
     with pytest.raises(ResultsError, match="same seeds"):
         compare_over_seeds("acc", "a", "b", a, b[:2])
+
+
+@pytest.mark.parametrize("counts", [(3, 2), (1, 3), (4, 2), (3, 1), (3, 3)])
+def test_rows_are_compared_seed_by_seed_or_with_the_one_of_a_baseline(counts):
+    rows = {name: [{"acc": accuracy(LABEL, LABEL)}] * n for name, n in zip("ab", counts, strict=True)}
+    if counts[1] in (1, counts[0]):
+        assert [c.over for c in compare_rows("a", "b", ("acc",), rows, OBJECTS)] == ["objects", "seeds"]
+        return
+    with pytest.raises(ResultsError, match=r"a and b is .*: must have the same seeds; run the missing ones"):
+        compare_rows("a", "b", ("acc",), rows, OBJECTS)
 
 
 def test_comparison_over_objects_is_paired():

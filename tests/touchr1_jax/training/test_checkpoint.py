@@ -56,6 +56,13 @@ def test_newest_are_kept(tmp_path):
     np.testing.assert_array_equal(found.state["x"], 5)
 
 
+def test_what_must_come_before_a_checkpoint_does(tmp_path):
+    with Checkpoints(tmp_path, before_save=[].pop) as checkpoints, pytest.raises(IndexError):
+        checkpoints.save(1, start(), None)
+    with Checkpoints(tmp_path) as checkpoints:
+        assert checkpoints.latest() is None
+
+
 def test_saved_arrays_are_those_of_the_call_not_of_later_steps(tmp_path):
     """The writer works in the background while the next step takes the buffers over."""
     state = start()
