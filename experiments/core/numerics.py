@@ -73,10 +73,8 @@ def settings() -> dict[str, Any]:
     given = os.environ.get(FLAGS, "").strip()
     if given and not given.startswith("-") and Path(given).is_file():  # XLA then reads its flags from there
         given = Path(given).read_text(encoding="utf-8")
-    last = {
-        flag.partition("=")[0]: flag for flag in given.split() if not flag.startswith(HARMLESS)
-    }  # as XLA takes them
-    flags = sorted(last.values())
+    counted = (flag for flag in given.split() if not flag.startswith(HARMLESS))
+    flags = sorted(counted, key=lambda flag: f"{flag.partition('=')[0]}=")  # of one name in their order, as XLA does
     found = {name: jax.config.values[name] for name in SETTINGS} | {FLAGS: flags}
     now = {name: jax.config.values.get(name, default) for name, default in DEFAULTS.items()}
     found |= {name: value for name, value in now.items() if value != DEFAULTS[name]}
