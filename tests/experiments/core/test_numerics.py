@@ -51,6 +51,9 @@ def test_flags_in_a_file_and_variables_of_accelerators_are_settings(monkeypatch,
         ("OPENCV_CPU_DISABLE", "AVX2"),
         ("OPENCV_IPP", "disabled"),
         ("OPENCV_FFMPEG_CAPTURE_OPTIONS", "skip_frame;nokey"),
+        ("OPENCV_FFMPEG_DECODE_ATTEMPTS", "1"),
+        ("OPENCV_FFMPEG_READ_ATTEMPTS", "1"),
+        ("OPENCV_VIDEOIO_PRIORITY_CV_MJPEG", "9999"),
         ("OPENCV_VIDEOIO_PRIORITY_FFMPEG", "0"),
         ("OPENCV_VIDEOIO_PRIORITY_LIST", "CV_MJPEG,FFMPEG"),
         ("OPENBLAS_CORETYPE", "Haswell"),
@@ -60,6 +63,7 @@ def test_flags_in_a_file_and_variables_of_accelerators_are_settings(monkeypatch,
             one.setenv(name, value)
             assert numerics.settings() == {**before, name: value}
     monkeypatch.setenv("GLIBC_TUNABLES", "glibc.malloc.arena_max=1")
+    monkeypatch.setenv("OPENCV_VIDEOIO_PRIORITY_FFMPEG", "")
     assert numerics.settings() == before
 
 
