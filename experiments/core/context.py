@@ -282,13 +282,13 @@ class Context:
     def cached_arrays(
         self, name: str, make: Callable[[], Mapping[str, Any]], *, compressed: bool = False
     ) -> dict[str, np.ndarray]:
-        """The arrays in `name`.npz of the cache, made first where it is missing, and again where it is damaged."""
+        """The arrays in `name`.npz of the cache, made first where that is missing, damaged or not its own."""
         path = self.cache_dir / f"{name}.npz"
         if path.exists():
             try:
                 return read_arrays(path, name, earlier=False)
             except ArraysError as error:
-                self.print(f"{error}: it is made again")
+                self.print(f"{path} is made again ({error.__cause__})")
         write_arrays(path, make(), compressed=compressed, of=name)
         return read_arrays(path, name)
 
