@@ -276,7 +276,8 @@ class Context:
         """
         if self.once(stage, lambda: here) != here:
             raise ConfigurationError(
-                f"{what} changed since this run began: put a copy of it back, or start anew with --fresh"
+                f"{what} changed since this run began, or the code that reads this input did: put a copy back, or "
+                "start anew with --fresh"
             )
 
     def cached_arrays(
