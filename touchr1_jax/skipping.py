@@ -1,5 +1,6 @@
 """Updates that are left out because their gradient, or the policy after them, is not finite, and their number."""
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -43,14 +44,19 @@ def skip_nonfinite(optimizer: optax.GradientTransformation) -> optax.GradientTra
 
 
 def count_lost(before: Any, after: Any, lost: Bool[Array, ""]) -> Any:
-    """The state `after` an update that was not taken where `lost`: every `skip_nonfinite` in it counts the update."""
+    """The state `after` an update that was not taken where `lost`: every `skip_nonfinite` in it counts the update.
+
+    Any other update ends the row, also one that none of them received, as the first of those that
+    `optax.MultiSteps` gathers.
+    """
     counts = lambda node: isinstance(node, Skipping)
 
     def counted(old: Any, new: Any) -> Any:
         if not counts(new):
             return new
-        in_a_row = jnp.where(lost, old.in_a_row + 1, new.in_a_row)
-        return new._replace(skipped=jnp.where(lost, old.skipped + 1, new.skipped), in_a_row=in_a_row)
+        skipped = jnp.where(lost, old.skipped + 1, new.skipped)
+        in_a_row = jnp.where(lost, old.in_a_row + 1, jnp.where(skipped == old.skipped, 0, new.in_a_row))
+        return new._replace(skipped=skipped, in_a_row=in_a_row)
 
     return jax.tree.map(counted, before, after, is_leaf=counts)
 
@@ -58,9 +64,11 @@ def count_lost(before: Any, after: Any, lost: Bool[Array, ""]) -> Any:
 def count_skipped(state: Any) -> Int[Array, "2"] | None:
     """Updates that were left out so far and in a row until now, or `None` where no optimizer of a state counts them.
 
+    Where several count, the most that one of them did: an update that all of them left out is one.
+
     Args:
       state: any pytree; an array of its own comes back, for a step may take the state's buffers over.
     """
     nodes = jax.tree.leaves(state, is_leaf=lambda node: isinstance(node, Skipping))
     counts = [jnp.stack([node.skipped, node.in_a_row]) for node in nodes if isinstance(node, Skipping)]
-    return sum(counts[1:], counts[0]) if counts else None
+    return functools.reduce(jnp.maximum, counts) if counts else None

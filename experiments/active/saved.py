@@ -31,7 +31,8 @@ from experiments.active.encoder import (
 from experiments.active.policies import answerer, explore
 from experiments.active.world import TouchWorld, restored, stored
 from experiments.core.artifacts import DamagedFileError, jsonable, read_json, write_sealed
-from experiments.study.policies import POLICIES
+from experiments.core.runs import labelled
+from experiments.study.policies import FILE, POLICIES
 from sensors_io.json_files import require_regular
 from touchr1_jax.models.active_policy import ActivePolicy, build_active_policy
 from touchr1_jax.models.lm import DecoderConfig
@@ -134,11 +135,11 @@ def publish(
         scale=world.scale,
         budget=budget,
     )
-    save_explorer(run / POLICIES / name / str(seed), explorer)
+    save_explorer(run / POLICIES / name / str(seed), explorer, labelled(run, f"{POLICIES}/{name}/{seed}"))
 
 
-def save_explorer(folder: Path, explorer: Explorer) -> None:
-    """Write a policy; one that is there is replaced, `config.json` last."""
+def save_explorer(folder: Path, explorer: Explorer, file: str = "") -> None:
+    """Write a policy; one that is there is replaced, `config.json` last.  `file` says which it is of its run."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / CONFIG_FILE).unlink(missing_ok=True)
     flat = unstacked(traverse_util.flatten_dict({"policy": explorer.params}, sep="."))
@@ -155,6 +156,7 @@ def save_explorer(folder: Path, explorer: Explorer) -> None:
         "encoder": {"width": explorer.encoder.width, "layers": explorer.encoder.layers},
         "scale": explorer.scale,
         "budget": explorer.budget,
+        FILE: file,
         "sha256": hashlib.sha256((folder / SINGLE).read_bytes()).hexdigest(),
     }
     write_sealed(folder / CONFIG_FILE, jsonable(fields))

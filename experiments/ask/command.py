@@ -26,7 +26,7 @@ from experiments.core.commands import PROG, print_error, print_lines
 from experiments.core.errors import DataError
 from experiments.core.memory import require_memory
 from experiments.core.runner import COMPILED
-from experiments.study.policies import find_policy, is_policy, measured_figures
+from experiments.study.policies import FILE, find_policy, is_policy, measured_figures
 from sensors_io.commands.values import require_possible
 from sensors_io.errors import UserError
 from sensors_io.records import RecordStore
@@ -152,6 +152,7 @@ class ExportCommand(Places):
     def run(self) -> int:
         """Write the folder and return the exit status."""
         saved = find_policy(self.policy, self.runs_dir, self.weights).saved
+        saved = dataclasses.replace(saved, notes={name: x for name, x in saved.notes.items() if name != FILE})
         if isinstance(saved.policy, ReleasedPolicy):
             return self._merged(saved)
         figures = measured_figures(self.policy, self.runs_dir)

@@ -14,12 +14,14 @@ import numpy as np
 from experiments.active.contacts import ContactsConfig, kept_frames, one_contact, recorded_frames
 from experiments.active.saved import Exploration, Explorer, is_explorer
 from experiments.ask.inputs import GENERATED, UNSEEN_SEED, contact_row, filmed_sequence
+from experiments.core.artifacts import read_json
 from experiments.core.errors import DataError
-from experiments.study.policies import run_policy
+from experiments.study.policies import FILE, require_own, run_policy
 from sensors_io.index import INDEX
 from sensors_io.records import RecordStore
 from sensors_io.scenes.cards import solid_of
 from sensors_io.schema import Sequence
+from touchr1_jax.models.qwen.config import CONFIG_FILE
 from touchr1_jax.text.language import EXPLORED_ATTRIBUTES
 from touchr1_jax.text.plain_questions import read_question
 from touchr1_jax.training.compilation import compiled_quickly
@@ -43,10 +45,15 @@ def explorer_folder(name: str, runs_dir: Path) -> Path | None:
     """The folder of a policy that chooses its touches; `None` where the name is that of another policy or of none.
 
     Raises:
-      PolicyError: a run without this policy.
+      PolicyError: a run without this policy, or with that of another run, arm or seed in its place.
     """
-    folder = run_policy(name, runs_dir) or Path(name)
-    return folder if is_explorer(folder) else None
+    own = run_policy(name, runs_dir)
+    folder = own or Path(name)
+    if not is_explorer(folder):
+        return None
+    if own is not None:
+        require_own(own, read_json(own / CONFIG_FILE).get(FILE))
+    return folder
 
 
 def explored(

@@ -276,19 +276,20 @@ class Context:
         """
         if self.once(stage, lambda: here) != here:
             raise ConfigurationError(
-                f"{what} changed since this run began: put a copy of it back, or start anew with --fresh"
+                f"{what} changed since this run began, or the code that reads this input did: put a copy back, or "
+                "start anew with --fresh"
             )
 
     def cached_arrays(
         self, name: str, make: Callable[[], Mapping[str, Any]], *, compressed: bool = False
     ) -> dict[str, np.ndarray]:
-        """The arrays in `name`.npz of the cache, made first where it is missing, and again where it is damaged."""
+        """The arrays in `name`.npz of the cache, made first where that is missing, damaged or not its own."""
         path = self.cache_dir / f"{name}.npz"
         if path.exists():
             try:
                 return read_arrays(path, name, earlier=False)
             except ArraysError as error:
-                self.print(f"{error}: it is made again")
+                self.print(f"{path} is made again ({error.__cause__})")
         write_arrays(path, make(), compressed=compressed, of=name)
         return read_arrays(path, name)
 

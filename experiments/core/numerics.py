@@ -50,12 +50,15 @@ ENVIRONMENT: Mapping[str, str] = {
     "OPENBLAS_NUM_THREADS": "1",
     "OPENCV_CPU_DISABLE": "",
     "OPENCV_FFMPEG_CAPTURE_OPTIONS": "",
+    "OPENCV_FFMPEG_DECODE_ATTEMPTS": "",
+    "OPENCV_FFMPEG_READ_ATTEMPTS": "",
     "OPENCV_IPP": "",
-    "OPENCV_VIDEOIO_PRIORITY_FFMPEG": "",
-    "OPENCV_VIDEOIO_PRIORITY_LIST": "",
 }
 """Environment variables that accelerators, XLA's oneDNN, NumPy, OpenCV and the C library read, with defaults; they
 count where they differ."""
+
+DECODERS = "OPENCV_VIDEOIO_PRIORITY_"
+"""Variables that begin so count too: each gives a decoder of OpenCV's its rank, or lists them."""
 
 HARMLESS = ("--xla_force_host_platform_device_count", "--xla_dump", "--xla_hlo_profile")
 """Flags of XLA that change no result."""
@@ -73,10 +76,8 @@ def settings() -> dict[str, Any]:
     given = os.environ.get(FLAGS, "").strip()
     if given and not given.startswith("-") and Path(given).is_file():  # XLA then reads its flags from there
         given = Path(given).read_text(encoding="utf-8")
-    last = {
-        flag.partition("=")[0]: flag for flag in given.split() if not flag.startswith(HARMLESS)
-    }  # as XLA takes them
-    flags = sorted(last.values())
+    counted = (flag for flag in given.split() if not flag.startswith(HARMLESS))
+    flags = sorted(counted, key=lambda flag: f"{flag.partition('=')[0]}=")  # of one name in their order, as XLA does
     found = {name: jax.config.values[name] for name in SETTINGS} | {FLAGS: flags}
     now = {name: jax.config.values.get(name, default) for name, default in DEFAULTS.items()}
     found |= {name: value for name, value in now.items() if value != DEFAULTS[name]}
@@ -84,8 +85,9 @@ def settings() -> dict[str, Any]:
 
 
 def environment() -> dict[str, str]:
-    """The variables of `ENVIRONMENT` that differ from their defaults; of the C library's, what chooses its kernels."""
-    found = {name: os.environ[name] for name, usual in ENVIRONMENT.items() if os.environ.get(name, usual) != usual}
+    """Variables of `ENVIRONMENT` and `DECODERS` not at their defaults; of the C library's, what chooses its kernels."""
+    usual = {**ENVIRONMENT, **{name: "" for name in sorted(os.environ) if name.startswith(DECODERS)}}
+    found = {name: os.environ[name] for name, value in usual.items() if os.environ.get(name, value) != value}
     return {name: value for name, value in found.items() if name != "GLIBC_TUNABLES" or "glibc.cpu." in value}
 
 

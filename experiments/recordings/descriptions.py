@@ -218,6 +218,5 @@ def _cached(
     context: Context, name: str, identity: Sequence[object], make: Callable[[], dict[str, np.ndarray]]
 ) -> dict[str, np.ndarray]:
     """Arrays from a file of the cache that is named by the hash of an identity and of NumPy's and OpenCV's settings."""
-    settings = [found] if (found := numerics.environment()) else []  # files of earlier versions keep their names
-    digest = hashlib.sha256(json.dumps([*identity, *settings]).encode()).hexdigest()[:16]
+    digest = hashlib.sha256(json.dumps([*identity, numerics.environment()]).encode()).hexdigest()[:16]
     return context.cached_arrays(f"{name}-{digest}", make, compressed=True)

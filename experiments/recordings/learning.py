@@ -14,7 +14,7 @@ import numpy as np
 from flax import traverse_util
 from jaxtyping import Float
 
-from experiments.core.artifacts import jsonable, write_arrays
+from experiments.core.artifacts import jsonable, read_arrays, write_arrays
 from experiments.core.context import Context
 from experiments.core.loops import stage_hooks
 from experiments.recordings.descriptions import ROWS, AuxiliaryData, DescribedVideos
@@ -163,11 +163,11 @@ def _padded(x: np.ndarray) -> np.ndarray:
     return np.pad(x, [(0, -len(x) % BLOCK), *[(0, 0)] * (x.ndim - 1)])
 
 
-def save(path: Path, trained: TrainedEnsemble) -> None:
-    """Publish an ensemble as one file."""
+def save(path: Path, trained: TrainedEnsemble, of: str = "") -> None:
+    """Publish an ensemble as one file; `of` as of `write_arrays`."""
     videos = {name: getattr(trained.training, name) for name in ROWS}
     parts = {"params": trained.params, "training": videos, "auxiliary": dict(vars(trained.auxiliary))}
-    write_arrays(path, {"identity": identity(trained.config), **traverse_util.flatten_dict(parts, sep="/")})
+    write_arrays(path, {"identity": identity(trained.config), **traverse_util.flatten_dict(parts, sep="/")}, of=of)
 
 
 def identity(config: LearnConfig) -> str:
@@ -175,11 +175,14 @@ def identity(config: LearnConfig) -> str:
     return hashlib.sha256(json.dumps(jsonable(config), sort_keys=True).encode()).hexdigest()[:16]
 
 
-def load(path: Path, config: LearnConfig) -> TrainedEnsemble:
-    """The ensemble that `save` published, of the same configuration."""
+def load(path: Path, config: LearnConfig, of: str = "") -> TrainedEnsemble:
+    """The ensemble that `save` published, of the same configuration; with `of`, `ArraysError` of another one."""
     if not path.is_file():
-        raise ImportSourceError(f"policy is {path}: no such file; train one, or name a run's policy.npz")
-    arrays = load_arrays(path)
+        raise ImportSourceError(
+            f"policy is {path}: no such file; give the --seeds that it was trained with, train one, or name a run's "
+            "policy.npz by --policy"
+        )
+    arrays = read_arrays(path, of) if of else load_arrays(path)
     if str(arrays["identity"]) != identity(config):
         raise ImportSourceError(f"policy is {path}: was trained with another `learn`; give the same, or train anew")
     found = traverse_util.unflatten_dict(arrays, sep="/")

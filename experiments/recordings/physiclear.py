@@ -24,7 +24,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from experiments.core.artifacts import write_bytes, write_json
+from experiments.core.artifacts import write_json
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
 from experiments.core.results import Requirement, Results, at_least, at_most, named_table
@@ -120,7 +120,8 @@ def run(config: PhysiclearStudy, context: Context) -> Results:
 def predict(config: PhysiclearStudy, out: Path, context: Context) -> Results:
     """Answer for videos with a trained policy; several that are named one by one are also answered together."""
     if config.data_dir is None:
-        trained = load(config.policy or cached_policy(config, context), config.learn)
+        own = cached_policy(config, context)
+        trained = load(config.policy or own, config.learn, of="" if config.policy else own.stem)
     else:
         trained = policy_of(config, config.data_dir, context)
     videos = describe_files(videos_of(config.predict), config.frames, context)
@@ -144,13 +145,13 @@ def policy_of(config: PhysiclearStudy, data_dir: Path, context: Context) -> Trai
     videos, auxiliary = every.labelled(), auxiliary_data(config.scenes, config.scene_sets, every, context)
     path = cached_policy(config, context)
     if path.exists():
-        kept = load(path, config.learn)
+        kept = load(path, config.learn, of=path.stem)
         pairs = [(getattr(kept.training, name), getattr(videos, name)) for name in ("objects", "label", "x")]
         pairs += [(getattr(kept.auxiliary, name), value) for name, value in vars(auxiliary).items()]
         pairs.append((np.nan_to_num(kept.training.rating, nan=-1), np.nan_to_num(videos.rating, nan=-1)))
         if all(np.array_equal(a, b) for a, b in pairs):
             return kept
-        context.print(f"{path} was trained on other videos or scenes, and is made again")
+        context.print(f"{path} was trained on other videos or scenes: another policy is trained")
     train_policy(config, videos, auxiliary, context)
     return load(context.directory / POLICY, config.learn)
 
@@ -254,10 +255,11 @@ def training_time(timing: Mapping[str, float], seed: int) -> dict[str, float]:
 
 def train_policy(config: PhysiclearStudy, videos: DescribedVideos, auxiliary: AuxiliaryData, context: Context) -> None:
     """Train on all objects and keep the policy in the run and, for predictions, in the cache."""
-    path = context.directory / POLICY
-    save(path, learn(config.learn, videos, auxiliary, config.seeds[0], context, "policy"))
+    trained = learn(config.learn, videos, auxiliary, config.seeds[0], context, "policy")
+    save(context.directory / POLICY, trained)
     if config.objects is None:
-        write_bytes(cached_policy(config, context), path.read_bytes())
+        path = cached_policy(config, context)
+        save(path, trained, of=path.stem)
 
 
 def cached_policy(config: PhysiclearStudy, context: Context) -> Path:

@@ -81,9 +81,7 @@ def find_policy(name: str, runs_dir: Path, weights: Path | None = None) -> Askab
     folder = run_policy(name, runs_dir)
     if folder is not None:
         found = load_policy(folder, weights)
-        said = found.saved.notes.get(FILE)  # those of earlier versions do not say
-        if said and said != (own := runs.labelled(folder.parents[2], "/".join(folder.parts[-3:]))):
-            raise PolicyError(f"policy is {folder}: it is of {said}, must be of {own}; put its own copy back")
+        require_own(folder, found.saved.notes.get(FILE))
         return found
     if not name or name.startswith(HUB) or path.exists() or name in shipped():
         return load_policy(name or None, weights)
@@ -91,6 +89,12 @@ def find_policy(name: str, runs_dir: Path, weights: Path | None = None) -> Askab
         f"policy is {name!r}: must be a run, RUN/ARM or RUN/ARM/SEED under {runs_dir}, a policy's folder, "
         f"{HUB}USER/NAME, or one of {', '.join(shipped()) or 'those that come with the package (none)'}"
     )
+
+
+def require_own(folder: Path, said: object) -> None:
+    """`PolicyError` if the policy in a run's folder `said` that it is another; those of earlier versions say nothing."""
+    if said and said != (own := runs.labelled(folder.parents[2], "/".join(folder.parts[-3:]))):
+        raise PolicyError(f"policy is {folder}: it is of {said}, must be of {own}; put its own copy back")
 
 
 def measured_figures(name: str, runs_dir: Path) -> dict[str, str]:

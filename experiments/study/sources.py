@@ -63,7 +63,8 @@ def prepare_records(config: SourceConfig, context: Context) -> Path:
     if config.data == "records":
         return config.data_dir
     source, settings = config.data_dir.resolve(), config.physiclear
-    about = [str(source), dataclasses.asdict(settings), *filter(None, [numerics.environment()])]  # decoded by OpenCV
+    decoding = {name: x for name, x in numerics.environment().items() if name.startswith("OPENCV_")}
+    about = [str(source), dataclasses.asdict(settings), *filter(None, [decoding])]
     identity = json.dumps(about, sort_keys=True)
     path = context.cache_dir / f"physiclear-{hashlib.sha256(identity.encode()).hexdigest()[:16]}"
     _make(context, "importing videos", lambda report: import_physiclear(source, path, config=settings, progress=report))

@@ -13,7 +13,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax._src import compilation_cache as jax_cache  # its compressors have no public name
 from jax.experimental.compilation_cache import compilation_cache
 
 WORTH_KEEPING_S = 0.1
@@ -44,11 +43,12 @@ def compilations_kept(directory: Path, least_s: float = WORTH_KEEPING_S) -> Iter
 
     A half-written entry of a killed process is removed first, because JAX would refuse to write other entries.  Entries
     are compressed by zlib, whose checksum names a flipped bit: where zstandard is installed JAX takes it without one.
+    The folder's name says so, for JAX may give an entry of either the same key.
     """
     if jax.config.values["jax_compilation_cache_dir"] is not None:
         yield
         return
-    folder = directory / processor()
+    folder = directory / f"{processor()}-zlib"
     folder.mkdir(parents=True, exist_ok=True)
     remove_half_written(folder)
     settings = {
@@ -57,15 +57,14 @@ def compilations_kept(directory: Path, least_s: float = WORTH_KEEPING_S) -> Iter
         "jax_persistent_cache_min_compile_time_secs": least_s,
     }
     before = {name: jax.config.values[name] for name in settings}
-    without_sums: dict[str, Any] = {
-        name: vars(jax_cache)[name] for name in ("zstd", "zstandard") if name in vars(jax_cache)
-    }
-    vars(jax_cache).update(dict.fromkeys(without_sums))
+    own = compilation_cache.reset_cache.__globals__  # of the module that compresses, which has no public name
+    without_sums: dict[str, Any] = {name: own[name] for name in ("zstd", "zstandard") if name in own}
+    own.update(dict.fromkeys(without_sums))
     _set(settings)
     try:
         yield
     finally:
-        vars(jax_cache).update(without_sums)
+        own.update(without_sums)
         _set(before)
 
 

@@ -288,6 +288,7 @@ def test_an_exported_folder_and_a_repository_of_the_hub_are_policies(runs, asked
     monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
     card = (folder / "README.md").read_text(encoding="utf-8")
     assert "| measured | on 5 unseen objects, 1 seeds, 95 % over objects |" in card
+    assert "| file |" not in card
     assert "| 68.1 [60.0, 70.0] % |" in card
     frames = {"tac3d": np.zeros((1, 28, 28, 3), np.uint8)}
     assert load_policy("hub:me/touch").ask(frames, "How hard?") == asked.ask(frames, "How hard?")

@@ -9,9 +9,12 @@ import pytest
 
 from experiments.active.saved import save_explorer
 from experiments.ask.command import run_asking
-from experiments.ask.exploring import request, unseen_object
+from experiments.ask.exploring import explorer_folder, request, unseen_object
+from experiments.core.artifacts import write_json
 from experiments.core.errors import DataError
-from tests.experiments.active.explorers import CONTACTS, touching
+from experiments.core.runs import labelled
+from tests.experiments.active.explorers import CONTACTS, explorer, touching
+from touchr1_jax.models.saved_policy import PolicyError
 from touchr1_jax.text.turns import QUESTIONS_OF_TOUCH
 
 
@@ -22,6 +25,17 @@ def saved(tmp_path_factory):
     folder = tmp_path_factory.mktemp("policy") / "chosen"
     save_explorer(folder, one)
     return str(folder), f"{list(QUESTIONS_OF_TOUCH.values())[question]}?"
+
+
+def test_a_policy_of_another_seed_is_not_taken_for_a_run_s_own(tmp_path):
+    about = {"experiment": "x", "scale": "", "command": "", "config": {}, "git": {"commit": "", "dirty": False}}
+    write_json(tmp_path / "config.json", about)
+    own = labelled(tmp_path, "policies/rl/0")
+    for seed in ("0", "1"):
+        save_explorer(tmp_path / "policies" / "rl" / seed, explorer(0), own)
+    assert explorer_folder(f"{tmp_path}/rl/0", tmp_path) == tmp_path / "policies" / "rl" / "0"
+    with pytest.raises(PolicyError, match=r"it is of policies/rl/0 \w{8}, must be of policies/rl/1 "):
+        explorer_folder(f"{tmp_path}/rl/1", tmp_path)
 
 
 def ask(saved, home, *arguments):

@@ -171,6 +171,10 @@ def test_a_stage_and_arrays_of_another_name_or_run_are_made_again(context):
     assert context.cached_arrays("sft/0", lambda: {"a": np.array(7)}) == {"a": 7}
     np.savez(context.cache_dir / "sft" / "0.npz", b=np.zeros(2))  # of another program
     assert context.cached_arrays("sft/0", lambda: {"a": np.array(6)}) == {"a": 6}
+    printed = context.console.file.getvalue().replace("\n", " ")
+    for reason in ("it is of sft/1: must be of sft/0", "it does not say what it is: must be of sft/0"):
+        assert f"sft/0.npz is made again ({reason})" in printed
+    assert "copy back" not in printed
     assert context.once("sft/0", lambda: 7) == 7
     assert "stage sft/0 is done again" in context.console.file.getvalue()
     about = {"experiment": "", "scale": "", "command": "", "git": {"commit": "", "dirty": False}}

@@ -19,17 +19,18 @@ FAKES = "tests.experiments.fakes"
 @pytest.mark.parametrize(
     ("flags", "kept"),
     [
-        ("--xla_cpu_enable_fast_math=true --xla_cpu_max_isa=SSE4_2", 2),
-        ("--xla_cpu_multi_thread_eigen=false --xla_backend_optimization_level=0", 2),
-        ("--xla_force_host_platform_device_count=8 --xla_dump_to=/tmp/x", 0),
-        ("--xla_cpu_enable_fast_math=false --xla_cpu_enable_fast_math=true", 1),  # the last one counts
+        ("--xla_cpu_enable_fast_math=true --xla_cpu_max_isa=SSE4_2", (0, 1)),
+        ("--xla_cpu_multi_thread_eigen=false --xla_backend_optimization_level=0", (1, 0)),
+        ("--xla_force_host_platform_device_count=8 --xla_dump_to=/tmp/x", ()),
+        ("--xla_cpu_enable_fast_math=true --xla_cpu_enable_fast_math=false", (0, 1)),  # the last one counts
+        ("--xla_disable_hlo_passes=b --xla_cpu_max_isa=AVX --xla_disable_hlo_passes=a", (1, 0, 2)),  # both count
     ],
 )
 def test_flags_that_change_results_are_settings(monkeypatch, flags, kept):
     monkeypatch.setenv(FLAGS, "")
     before = numerics.settings()
     monkeypatch.setenv(FLAGS, flags)
-    assert len(numerics.settings()[FLAGS]) == kept
+    assert numerics.settings()[FLAGS] == [flags.split()[i] for i in kept]
     assert bool(numerics.changed(before, numerics.settings())) == bool(kept)
     numerics.require_same(None, "a run of an earlier version")
 
@@ -50,6 +51,9 @@ def test_flags_in_a_file_and_variables_of_accelerators_are_settings(monkeypatch,
         ("OPENCV_CPU_DISABLE", "AVX2"),
         ("OPENCV_IPP", "disabled"),
         ("OPENCV_FFMPEG_CAPTURE_OPTIONS", "skip_frame;nokey"),
+        ("OPENCV_FFMPEG_DECODE_ATTEMPTS", "1"),
+        ("OPENCV_FFMPEG_READ_ATTEMPTS", "1"),
+        ("OPENCV_VIDEOIO_PRIORITY_CV_MJPEG", "9999"),
         ("OPENCV_VIDEOIO_PRIORITY_FFMPEG", "0"),
         ("OPENCV_VIDEOIO_PRIORITY_LIST", "CV_MJPEG,FFMPEG"),
         ("OPENBLAS_CORETYPE", "Haswell"),
@@ -59,6 +63,7 @@ def test_flags_in_a_file_and_variables_of_accelerators_are_settings(monkeypatch,
             one.setenv(name, value)
             assert numerics.settings() == {**before, name: value}
     monkeypatch.setenv("GLIBC_TUNABLES", "glibc.malloc.arena_max=1")
+    monkeypatch.setenv("OPENCV_VIDEOIO_PRIORITY_FFMPEG", "")
     assert numerics.settings() == before
 
 

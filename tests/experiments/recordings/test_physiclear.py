@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+from pathlib import Path
 
 import cv2
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from experiments.core.artifacts import read_json
 from experiments.core.runner import main, run_experiment
 from experiments.recordings import physiclear
+from experiments.recordings.learning import identity
 from tests.experiments import tiny
 from tests.experiments.recordings.presses import press
 from tests.experiments.shrunk import only_run
@@ -67,7 +69,7 @@ def test_every_video_is_answered_by_a_policy_that_never_met_its_object(run):
 
 
 @pytest.mark.long
-def test_a_kept_policy_answers_for_a_folder(run):
+def test_a_kept_policy_answers_for_a_folder(run, capsys):
     home, data, directory, places = run
     unseen = home / "unseen"
     unseen.mkdir()
@@ -96,6 +98,15 @@ def test_a_kept_policy_answers_for_a_folder(run):
     (home / "runs" / "physiclear" / "latest" / "results.json").unlink()  # the same run goes on
     (other / "labels.json").write_text(json.dumps(table | {"objects": table["objects"][:4]}))
     assert run_small("--predict", str(unseen), "--out", str(out), *order[:-1], *places) == 1
+    assert "other videos or scenes: another policy is trained" in " ".join(capsys.readouterr().out.split())
+    kept = Path(places[-1]) / f"physiclear-policy-{identity(SMOKE.learn)}-1001.npz"
+    asked = ["--predict", str(unseen), "--out", str(out), "--fresh", *places]
+    assert run_small(*asked) == 0
+    assert run_small(*asked, "--seeds", "7", "8") == 1
+    assert "no such file; give the --seeds that it was trained with" in capsys.readouterr().err
+    shutil.copy(kept, kept.with_name(kept.name.replace("-1001", "-7")))
+    assert run_small(*asked, "--seeds", "7", "8") == 1
+    assert "-1001: must be of physiclear-policy-" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["physiclear", "sim_to_real"])

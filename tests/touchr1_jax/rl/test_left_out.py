@@ -138,10 +138,13 @@ def test_an_optimizer_of_a_callers_own_never_receives_what_is_not_finite(bad):
     jax.tree.map(np.testing.assert_array_equal, same, (PARAMS, before))
     guarded = skip_nonfinite(OPTIMIZER)
     several = optax.MultiSteps(guarded, 2).gradient_transformation()
-    for own in (guarded, several, optax.chain(optax.clip_by_global_norm(1.0), guarded)):
+    chained = optax.chain(optax.clip_by_global_norm(1.0), guarded)
+    for own in (guarded, several, chained, optax.chain(guarded, guarded)):
         params, state = finite_update(own, grads, optax.tree.norm(grads), own.init(PARAMS), PARAMS)
         jax.tree.map(np.testing.assert_array_equal, params, PARAMS)
         assert count_skipped(state).tolist() == [1, 1]
+        _, state = finite_update(own, PARAMS, optax.tree.norm(PARAMS), state, PARAMS)
+        assert count_skipped(state).tolist() == [1, 0]
 
 
 def test_finite_gradients_reach_it_as_they_are():

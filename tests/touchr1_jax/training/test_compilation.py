@@ -52,13 +52,14 @@ def compiled(x: float) -> float:
 
 
 def test_a_program_is_kept_and_found_again(keeping, tmp_path):
+    """Not in the folder of earlier versions, where zstandard may have compressed an entry of the same key."""
     with compilations_kept(tmp_path, least_s=0.0):
         first = compiled(0.5)
         kept = entries(tmp_path)
         jax.clear_caches()
         assert compiled(0.5) == first
     assert kept
-    assert {path.parts[0] for path in kept} == {processor()}
+    assert {path.parts[0] for path in kept} == {f"{processor()}-zlib"}
     assert entries(tmp_path) == kept
 
 
@@ -82,7 +83,7 @@ def test_a_half_written_entry_does_not_stop_the_keeping(keeping, tmp_path):
     """A killed process left the program without the time of its use: JAX would warn and never write again."""
     with compilations_kept(tmp_path, least_s=0.0):
         compiled(0.5)
-    folder = tmp_path / processor()
+    (folder,) = tmp_path.iterdir()
     (whole,) = folder.glob("*-cache")
     young, old = folder / "jit_young-cache", folder / "jit_old-cache"
     for path in (young, old):
