@@ -6,6 +6,7 @@ them.  Everything else ends a word: punctuation of any script, symbols, blanks, 
 
 import codecs
 import functools
+import sys
 import unicodedata
 
 import numpy as np
@@ -71,10 +72,9 @@ def _cut(piece: bytes) -> tuple[bytes, tuple[int, ...], bytes]:
 
 def _feed(node: int, head: bytes, more: bool) -> tuple[int, int]:
     """Case of a head from a node, and the node after it; `more` bytes break what stays open."""
-    nodes, _ = _automaton()
     found: list[bool] = []
     for byte in head:
-        after = nodes[node][byte - 0x80] if node else 0
+        after = _automaton()[0][node][byte - 0x80] if node else 0
         node = max(after, 0)
         if after <= 0:
             found.append(after == _IN_WORD)
@@ -99,15 +99,14 @@ def _node(prefix: bytes) -> int:
 def _automaton() -> tuple[list[tuple[int, ...]], dict[int, int]]:
     """Minimal automaton of the bytes after a lead byte: the 64 successors of each node, and each lead byte's node."""
     nodes: dict[tuple[int, ...], int] = {(): 0}
-
-    def leaf(code: int, lowest: int) -> int:
-        if code < lowest or 0xD800 <= code < 0xE000 or code > 0x10FFFF:
-            return 0
-        return _IN_WORD if is_word(chr(code)) else _ENDS_WORD
+    leaves = [_IN_WORD if is_word(char) else _ENDS_WORD for char in map(chr, range(sys.maxunicode + 1))]
+    leaves[0xD800:0xE000] = [0] * 0x800  # surrogates have no UTF-8
 
     def node(first: int, size: int, lowest: int) -> int:
-        under = range(first, first + 64 * size, size)
-        row = tuple(leaf(c, lowest) if size == 1 else node(c, size // 64, lowest) for c in under)
+        if size > 1:
+            row = tuple(node(code, size // 64, lowest) for code in range(first, first + 64 * size, size))
+        else:
+            row = tuple(leaves[first : first + 64]) if first >= lowest else ()
         return nodes.setdefault(row, len(nodes)) if any(row) else 0
 
     leads = {0xC0 + i: node(i * 64, 1, 0x80) for i in range(2, 32)}

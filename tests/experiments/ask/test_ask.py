@@ -54,6 +54,7 @@ def asked(runs):
     return find_policy(str(runs / "trial"), runs)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("steps", "place"), [(9, "sft/0"), (0, "sft/1"), (0, "paper/0")])
 def test_a_policy_of_another_run_arm_or_seed_is_not_taken_for_a_run_s_own(runs, tmp_path, steps, place):
     shutil.copytree(runs / "trial" / "latest" / "policies" / "sft" / "0", tmp_path / "policies" / place)

@@ -145,6 +145,7 @@ def test_ctrl_c_leaves_no_traceback(monkeypatch):
     assert main(["annotate-sheets", "x" * 300, "--out", "labels"]) == 1
 
 
+@pytest.mark.long
 def test_annotation_by_command(tmp_path, records, capsys):
     folder, objects = tmp_path / "labels", RecordStore(records).objects
     assert main(["annotate-sheets", str(records), "--out", str(folder)]) == 0

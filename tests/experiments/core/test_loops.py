@@ -93,6 +93,7 @@ def test_the_report_has_the_alarms_of_each_stage():
 
 
 # Orbax gives up at the first array that it cannot read; what the others call back then finds its loop closed
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_damage_is_reported_and_costs_the_steps_since(whole, tmp_path, capsys):
     shutil.copytree(whole, tmp_path, symlinks=True, dirs_exist_ok=True)
@@ -122,6 +123,7 @@ def test_no_run_ends_with_a_part_of_its_log(whole, tmp_path, capsys, kept, ended
     assert not (directory / "results.json").exists()
 
 
+@pytest.mark.long
 def test_no_run_goes_on_with_the_log_of_another(tmp_path, capsys, monkeypatch):
     """Both were killed in the middle of the same stage."""
     append = MetricLog.append

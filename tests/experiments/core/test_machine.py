@@ -87,6 +87,7 @@ def test_one_process_asks_no_other(monkeypatch):
     assert SINGLE_PROCESS.split_work(np.arange(3), lambda rows: rows + 1).tolist() == [1, 2, 3]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("process", [0, 1])
 def test_processes_that_nobody_joins_say_so_and_end(process):
     with socket.create_server(("127.0.0.1", 0)) as server:

@@ -29,6 +29,7 @@ def test_there_are_at_least_25_kinds():
     assert len(set(NAMES)) == len(NAMES) >= 25
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in NAMES])
 def test_bad_input_is_answered(unfinished, tmp_path, name):
     (case,) = (case for case in cases(unfinished) if case.name == name)

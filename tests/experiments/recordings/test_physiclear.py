@@ -109,6 +109,7 @@ def test_a_kept_policy_answers_for_a_folder(run, capsys):
     assert "-1001: must be of physiclear-policy-" in capsys.readouterr().err
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["physiclear", "sim_to_real"])
 @pytest.mark.parametrize(
     ("arguments", "message"),

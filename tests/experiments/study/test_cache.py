@@ -113,6 +113,7 @@ def grpo(policy, params, data, tmp_path):
     return run
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("other", "trained"),
     [

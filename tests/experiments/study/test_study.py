@@ -151,6 +151,7 @@ def test_every_baseline_answers_the_questions_of_the_policies(study):
     assert table(study, rows["constant_middle"])["middle_rate"] == 100
 
 
+@pytest.mark.long
 def test_force_that_gives_hardness_away_is_found_out_where_it_is_measured(study):
     assert table(study, baselines(study)["force_only"])["h_acc"] == 100
     silent = dataclasses.replace(study, data=dataclasses.replace(study.data, has_force=False))
@@ -210,6 +211,7 @@ def test_reports_name_the_algorithm_by_which_arms_train():
     assert study_settings(published)["preset"] == "paper"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("part", "changes", "message"),
     [

@@ -236,6 +236,7 @@ def test_another_licence_is_refused(tmp_path):
     refused(RecordsExistError, "not 'CC0': one directory has one licence", session, tmp_path, Hand(), other)
 
 
+@pytest.mark.long
 def test_a_pause_before_the_first_touch_is_not_recorded(tmp_path):
     """Of a minute without a touch the last 10 to 20 s are kept: all would not fit into memory when it is stored."""
 

@@ -59,6 +59,7 @@ def test_generation_ends_and_refuses_a_start_outside() -> None:
     refused(ValueError, r"start is 121: must lie in \[0, 120\]", contacts, SMALL, start=121)
 
 
+@pytest.mark.long
 def test_each_contact_holds_the_four_sensors_in_order() -> None:
     for contact in one_per_object(5):
         assert tuple(s.sensor for s in contact) == SENSORS

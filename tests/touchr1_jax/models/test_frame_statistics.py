@@ -45,6 +45,7 @@ def test_statistics_equal_a_plain_computation():
     np.testing.assert_allclose(whole[0, :, 0], by_hand(FRAMES[0], 0, 0, (16, 24)), atol=2e-4)
 
 
+@pytest.mark.long
 def test_scaled_statistics_hold_the_patch_and_the_mean_patch():
     found = np.asarray(scaled_statistics(jnp.asarray(FRAMES), 8))
     assert found.shape[-1] == WIDTH

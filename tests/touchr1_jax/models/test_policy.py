@@ -65,6 +65,7 @@ def test_encoded_touch_carries_its_frame_indices():
     assert len(np.unique(features.touch_time[0, 0])) == tiny.FRAMES // 2
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("content", [0.0, 1e4])
 def test_absent_streams_and_views_hold_nothing(batch, content):
     """Whatever stands in a stream or view that is not there, the logits stay the same to the bit."""

@@ -58,6 +58,7 @@ def test_everything_survives(saved, folder):
     assert [p.name for p in folder.parent.iterdir()] == ["policy"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("precision", "bound"), [("float16", 2**-11), ("int8", 1 / 254)])
 def test_rounding_is_at_most_half_a_step_of_the_largest_weight(saved, tmp_path, precision, bound):
     save_policy(tmp_path / "p", saved, precision=precision)

@@ -74,6 +74,7 @@ def test_a_stem_cell_is_a_square_of_pixels():
         np.testing.assert_array_equal(changed, expected)
 
 
+@pytest.mark.long
 def test_the_first_frame_is_what_changes_are_measured_from(patches):
     frames = np.random.default_rng(1).uniform(0, 255, (F, H, W, 3)).astype(np.float32)
     touched = frames.copy()

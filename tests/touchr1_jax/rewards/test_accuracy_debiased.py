@@ -20,6 +20,7 @@ def test_hand_values():
     assert one_of_three(1, -1) == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("attribute", range(3))
 def test_every_constant_earns_the_same(attribute, seed):

@@ -50,6 +50,7 @@ def test_a_format_without_an_answer_earns_nothing(formatted, conclude, earned):
     assert value("format_strict", make_parsed((conclude, 0, 0), formatted=formatted), 0) == earned
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("prior", PRIORS)
 def test_an_honest_miss_earns_more_than_any_answer_that_cannot_be_read(prior):
     rewards, weights = make_rewards(with_prior(prior)), stable_weights(PUBLISHED)

@@ -52,6 +52,7 @@ def test_noise_is_a_draw_of_the_same_sensor():
     np.testing.assert_array_equal(applies, [True, True, False, True, True])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("steps", [2, 3, 5])
 def test_shuffle_permutes_whole_steps_and_is_never_the_identity(steps):
     features = longer(1, steps)

@@ -134,6 +134,7 @@ ALGORITHMS = (
 )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("algorithm", ALGORITHMS, ids=lambda a: f"{type(a).__name__}, {a.learn_conclusion}")
 def test_mean_gradient_over_all_groups_is_that_of_the_expected_reward(algorithm):
     """A policy of two traces, one token each, and three levels; every group of two traces by its probability.
@@ -303,6 +304,7 @@ def test_options_that_need_a_sampled_conclusion_are_refused(change):
         Paper(enumerated=Norm.STD, **change)
 
 
+@pytest.mark.long
 def test_a_sampled_conclusion_is_always_learned():
     with pytest.raises(ValueError, match="learn_conclusion"):
         Paper(learn_conclusion=False)

@@ -15,6 +15,8 @@ from touchr1_jax.rl.gradient import Experience, grpo_gradient, prompt_terms
 from touchr1_jax.rl.losses import token_log_probs
 from touchr1_jax.types import Rollout
 
+pytestmark = pytest.mark.long
+
 P, G, T = 4, 2, 4
 FNS = tiny.SHALLOW
 PARAMS, REFERENCE = tiny.shallow_params(0), tiny.shallow_params(1)
@@ -68,7 +70,6 @@ def logits_of(experience: Experience) -> list[np.ndarray]:
     return [np.asarray(group_logits(p, f, b.ids, b.mask, experience.rollout.tokens)) for p, f in runs]
 
 
-@pytest.mark.long
 def test_loss_and_parts_equal_a_float64_reference(experience, whole):
     rollout = jax.tree.map(np.asarray, experience.rollout)
     terms = reference.terms(
@@ -112,7 +113,6 @@ def one_stream(experience) -> Experience:
     return experience._replace(masked_touch=jnp.where(chosen, other, own), masked_stream=stream)
 
 
-@pytest.mark.long
 def test_an_anchor_adds_the_likelihood_of_the_answers_and_its_gradient(experience, whole):
     """As if each answer were a completion alone; of the first prompt none is known."""
     b, tokens = experience.batch, tiny.completions(3, P, 1, T)
@@ -136,7 +136,6 @@ def test_an_anchor_adds_the_likelihood_of_the_answers_and_its_gradient(experienc
         gradient(anchored)(experience)
 
 
-@pytest.mark.long
 def test_levels_that_are_not_learned_follow_the_reference_without_kl_too(experience):
     """At β = 0 the gradient is that of the least β; the KL of no other token is in it, and none is logged."""
     ids, at = jnp.arange(3, 6), jnp.ones((P, G), jnp.int32)
@@ -149,7 +148,6 @@ def test_levels_that_are_not_learned_follow_the_reference_without_kl_too(experie
     assert "kl" not in parts
 
 
-@pytest.mark.long
 def test_metrics_of_tokens_are_those_of_prompts_that_have_some(experience):
     """The rollouts of the first prompt were cut off and are masked, those of the second are dropped."""
     mask = experience.rollout.mask.at[0].set(False)
@@ -166,7 +164,6 @@ def test_metrics_of_tokens_are_those_of_prompts_that_have_some(experience):
         np.testing.assert_allclose(parts[name], np.mean([e[name] for e in each[first:]]), rtol=1e-5)
 
 
-@pytest.mark.long
 def test_stopped_branch_changes_the_gradient_but_no_value(one_stream):
     stopped = dataclasses.replace(CONFIG, algorithm=dataclasses.replace(ALGORITHM, grounding_stop_masked=True))
     (free, free_parts, _), (held, held_parts, _) = compute(one_stream, PARAMS), gradient(stopped)(one_stream)
@@ -182,7 +179,6 @@ def test_grounding_is_logged_for_every_stream(one_stream):
     np.testing.assert_allclose(by_stream, parts["grounding"], rtol=1e-5)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("kind", Surrogate)
 def test_no_ratio_is_clipped_at_the_first_update_whatever_the_sampler_computed(experience, kind):
     """The sampler's log-probabilities are off by up to ±.6, the clip range is a millionth, and bfloat16 rounds."""
@@ -198,7 +194,6 @@ def test_no_ratio_is_clipped_at_the_first_update_whatever_the_sampler_computed(e
     assert later["clip_share"] > 0
 
 
-@pytest.mark.long
 def test_under_a_cap_the_sampler_counts_in_the_weight_alone(experience):
     cap = 1.2
     config = dataclasses.replace(ALONE, algorithm=dataclasses.replace(ALONE.algorithm, importance_cap=cap))
@@ -212,7 +207,6 @@ def test_under_a_cap_the_sampler_counts_in_the_weight_alone(experience):
     np.testing.assert_allclose(parts["surrogate"], gain.mean(), rtol=1e-4)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("change", "tolerance"),
     [
@@ -244,7 +238,6 @@ def alone():
     return gradient(ALONE)
 
 
-@pytest.mark.long
 def test_zero_advantage_has_a_gradient_of_exactly_zero(experience, alone):
     grads, parts, _ = alone(experience._replace(advantage=jnp.zeros((P, G))))
     assert not any(np.any(g) for g in jax.tree.leaves(grads))
@@ -277,7 +270,6 @@ def grounding_of(one: Experience, touch: jax.Array) -> float:
     return float(jnp.mean(terms_of(one._replace(masked_touch=touch)).grounding, where=one.rollout.mask))
 
 
-@pytest.mark.long
 def test_grounding_is_zero_when_nothing_is_perturbed_and_sees_every_stream(experience):
     """Each stream in turn: no modality is silently left out of the perturbed branch."""
     one = jax.tree.map(lambda x: x[0], experience)
@@ -287,7 +279,6 @@ def test_grounding_is_zero_when_nothing_is_perturbed_and_sees_every_stream(exper
         assert grounding_of(one, touch.at[stream].set(one.masked_touch[stream])) > 1e-2
 
 
-@pytest.mark.long
 def test_grounding_ignores_a_stream_that_is_not_there(experience):
     one = jax.tree.map(lambda x: x[0], experience)
     features = one.batch.features

@@ -181,6 +181,7 @@ def test_a_step_that_takes_its_state_leaves_the_callers_key():
     jax.random.split(key)
 
 
+@pytest.mark.long
 def test_trained_parameters_have_32_bits():
     """An update of 1e-6 is less than bfloat16 rounds a weight of .02."""
     narrow = {"decoder": {"kernel": jnp.full(3, 0.02, jnp.bfloat16)}}

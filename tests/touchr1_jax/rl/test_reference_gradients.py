@@ -225,7 +225,10 @@ def distance(config: GRPOConfig, *, first: bool, by_token: bool = False, wrong: 
     return float(np.linalg.norm(slopes - exact) / np.linalg.norm(exact))
 
 
-@pytest.mark.parametrize("first", [True, False], ids=["first update", "later update"])
+FIRST = [pytest.param(True, marks=pytest.mark.long, id="first update"), pytest.param(False, id="later update")]
+
+
+@pytest.mark.parametrize("first", FIRST)
 @pytest.mark.parametrize("algorithm", ALGORITHMS.values(), ids=ALGORITHMS)
 def test_gradient_of_every_algorithm_and_option(algorithm, first):
     config = GRPOConfig(prompts=2 * P, micro_prompts=P, group=G, length=T + 2, algorithm=algorithm)
@@ -238,6 +241,7 @@ def test_gradient_under_every_way_to_sample(sampling):
     assert distance(config, first=False) <= NEAR
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("row", ROWS, ids=str)
 def test_gradient_of_options_together(row):
     of = options(row)

@@ -81,6 +81,7 @@ def test_without_an_end_the_loop_runs_to_the_length():
     assert (said.tokens == 5).all()
 
 
+@pytest.mark.long
 def test_compiled_and_uncompiled_agree(said):
     with jax.disable_jit():
         plain = draw()

@@ -30,6 +30,7 @@ def test_every_stream_that_is_read_moves_the_answers(influence):
     check_streams(size, present)
 
 
+@pytest.mark.long
 def test_a_stream_of_constants_is_refused(influence):
     """Touch and noise of stream 1 end in the same tokens, as behind an encoder that is not connected."""
     wire = lambda x: x.at[:, 1].set(0.5)

@@ -78,6 +78,7 @@ def test_actions_tokens_costs_and_answers_tell_one_story(legal):
     assert legal.parsed.formatted.all()
 
 
+@pytest.mark.long
 def test_observations_are_those_of_the_bank(legal):
     p, g, b = (int(x[0]) for x in np.nonzero(np.asarray(legal.exists.any(-1))))
     np.testing.assert_array_equal(legal.touch[p, g, b], BANK.tokens[OBJECTS[p], int(legal.action[p, g, b])])

@@ -17,6 +17,8 @@ from touchr1_jax.rl.trust_region import within_trust
 from touchr1_jax.rl.update import update_policy
 from touchr1_jax.skipping import count_skipped, skip_nonfinite
 
+pytestmark = pytest.mark.long
+
 G, T, DELTA = 8, 4, 0.01
 CONFIG = GRPOConfig(prompts=P, group=G, length=T, micro_prompts=P, algorithm=Paper())
 BEFORE = tiny.shallow_params(0)
@@ -42,14 +44,12 @@ def shorten(learn):
     return jax.jit(lambda size: within_trust(FNS, CONFIG, BEFORE, along(size), learn, DELTA))
 
 
-@pytest.mark.long
 def test_the_policy_that_sampled_has_the_sampled_log_probabilities(learn):
     ours = jax.jit(lambda: log_probs(FNS, CONFIG, BEFORE, learn.batch, learn.rollout))()
     mask = np.asarray(learn.rollout.mask)
     np.testing.assert_allclose(np.asarray(ours)[mask], np.asarray(learn.rollout.log_prob)[mask], atol=1e-4)
 
 
-@pytest.mark.long
 def test_a_short_update_stays(shorten):
     params, size = shorten(1e-3)
     assert size["update_scale"] == 1
@@ -58,7 +58,6 @@ def test_a_short_update_stays(shorten):
         np.testing.assert_allclose(a, b + 1e-3 * d, atol=1e-6)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("size", [0.1, 3.0], ids=["a little too long", "far too long"])
 def test_a_long_update_ends_near_its_bound(shorten, size):
     """One shortening is enough where KL is quadratic; a far update, where KL is flat, needs several."""
@@ -84,7 +83,6 @@ def test_an_update_without_a_finite_kl_is_left_out(shorten):
         np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.long
 def test_an_update_to_parameters_that_are_not_finite_is_left_out(learn):
     after = jax.tree.map(lambda a: jnp.full_like(a, jnp.inf), BEFORE)
     params, size = jax.jit(lambda after: within_trust(FNS, CONFIG, BEFORE, after, learn, DELTA))(after)
@@ -92,7 +90,6 @@ def test_an_update_to_parameters_that_are_not_finite_is_left_out(learn):
     jax.tree.map(np.testing.assert_array_equal, params, BEFORE)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("guard", "counts"), [(skip_nonfinite, [1, 1]), (lambda optimizer: optimizer, None)], ids=["ours", "a caller's own"]
 )
@@ -110,7 +107,6 @@ def test_an_update_that_is_left_out_is_counted(learn, guard, counts):
     assert found is counts or found.tolist() == counts
 
 
-@pytest.mark.long
 def test_rollouts_that_are_masked_do_not_make_an_update_look_shorter(learn):
     """Without the rollouts of one prompt the KL is that of the others, not less."""
     there = (jnp.arange(P) > 0)[:, None, None]

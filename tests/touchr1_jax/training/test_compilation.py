@@ -164,6 +164,7 @@ def test_a_step_compiles_once_whatever_part_of_its_state_came_from_a_checkpoint(
     assert committed(state)["params"] is of_checkpoint
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="only Linux counts mappings")
 def test_programs_are_dropped_and_compiled_again():
     mappings = lambda: len(Path("/proc/self/maps").read_text().splitlines())

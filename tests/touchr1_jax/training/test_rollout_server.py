@@ -36,6 +36,8 @@ from touchr1_jax.training.rollout_server import SEEDS, RolloutsConfig, RolloutSe
 from touchr1_jax.training.train_grpo import grpo_program
 from touchr1_jax.types import Parsed
 
+pytestmark = pytest.mark.long
+
 P, G, T = 2, 3, 5
 SENSORS = ("gelsight_mini", "xense")
 LORA = LoraConfig(rank=2, alpha=4.0, vision_targets=("qkv",))
@@ -160,7 +162,6 @@ def server_of(stand_in: StandIn, tmp_path, **changes) -> RolloutServer:
     return RolloutServer(RolloutsConfig(url=stand_in.url, **changes), tmp_path / "adapters")
 
 
-@pytest.mark.long
 def test_the_update_is_that_of_the_steps_own_rollouts(training, stand_in, tmp_path):
     """Two steps, so that the server must have got the adapters of the first update."""
     served = training.served(server_of(stand_in, tmp_path))
@@ -185,7 +186,6 @@ def test_the_update_is_that_of_the_steps_own_rollouts(training, stand_in, tmp_pa
     assert len(lengths) == 2  # absent streams and pictures are not sent
 
 
-@pytest.mark.long
 def test_in_bfloat16_the_mismatch_is_small_and_not_zero(folder, tmp_path):
     policy = policy_of(folder, "bfloat16")
     training = Training(policy, dataclasses.replace(CONFIG, bfloat16=True))
@@ -195,7 +195,6 @@ def test_in_bfloat16_the_mismatch_is_small_and_not_zero(folder, tmp_path):
     assert 0 < metrics["sampler_gap"] < 0.01
 
 
-@pytest.mark.long
 def test_rollouts_of_other_weights_are_dropped_and_change_nothing(training, stand_in, tmp_path):
     """A server that forgets the adapters; the limit is far above what rounding makes."""
     stand_in.ignores_adapters = True
@@ -205,7 +204,6 @@ def test_rollouts_of_other_weights_are_dropped_and_change_nothing(training, stan
     jax.tree.map(np.testing.assert_array_equal, state.params, training.trained)
 
 
-@pytest.mark.long
 def test_the_most_likely_tokens_reach_score_centering(policy, training, stand_in, tmp_path):
     """With the learner's own weights on the server the drift is zero, and so is what is subtracted."""
     algorithm = dataclasses.replace(ALGORITHM, score_centering=8)
@@ -224,7 +222,6 @@ def drawing(training, stand_in, tmp_path, **changes):
     return server.before(step, training.policy, table, CONFIG, SingleDevice())
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("fault", "changes"),
     [(refusing(503), QUICK), (refusing(429), QUICK), (truncated, QUICK), (silent, {**QUICK, "timeout_s": PATIENCE_S})],
@@ -238,7 +235,6 @@ def test_what_passes_is_tried_again(training, stand_in, tmp_path, fault, changes
     assert [path for path, _ in stand_in.requests].count(COMPLETE) == 2 * P + 1
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("faults", "message"),
     [
@@ -291,7 +287,6 @@ def fails(training, drawn, message: str) -> None:
     assert state.step == 0
 
 
-@pytest.mark.long
 def test_a_server_that_stays_silent_is_named(training, stand_in, tmp_path):
     drawn = drawing(training, stand_in, tmp_path, tries=1, timeout_s=PATIENCE_S)
     drawn(training.state(), training.batch)  # compiles what the server runs
@@ -299,7 +294,6 @@ def test_a_server_that_stays_silent_is_named(training, stand_in, tmp_path):
     fails(training, drawn, "gave no answer in 1 tries, the last ended in TimeoutError")
 
 
-@pytest.mark.long
 def test_a_server_without_the_adapters_is_named(training, stand_in, tmp_path, monkeypatch):
     monkeypatch.setattr(stand_in, "served", Forgetful())
     message = r"refuses with status 404 \(.*The model `touch-\w+` does not exist"
@@ -351,7 +345,6 @@ def test_policies_and_devices_that_no_server_can_follow_are_named(folder, traini
         check(placed, SingleDevice())
 
 
-@pytest.mark.long
 def test_a_url_without_a_protocol_is_named():
     with pytest.raises(ValueError, match=r"rollouts\.url is localhost:8000: must begin with http"):
         RolloutsConfig(url="localhost:8000")

@@ -120,6 +120,7 @@ def test_micro_batches_must_divide_the_batch(params, batch):
         sft_gradient(FNS, params, batch, micro_contacts=3)
 
 
+@pytest.mark.long
 def test_only_answer_tokens_count(params, batch):
     """Other ids where the prompt or the answer is padding, other pixels in a stream that the question may not feel."""
     before = loss(params, batch)

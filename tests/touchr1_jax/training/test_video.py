@@ -22,6 +22,8 @@ from touchr1_jax.training.video import (
     video_loss,
 )
 
+pytestmark = pytest.mark.long
+
 P, S = 2, tiny.S
 CONFIG = VideoConfig(
     encoder=dataclasses.replace(tiny.CONFIG.tactile, causal=True, frames_per_step=1),
@@ -51,7 +53,6 @@ def predict(state):
     return jax.jit(lambda b, a: VideoPredictor(CONFIG).apply({"params": params}, b, a))
 
 
-@pytest.mark.long
 def test_the_future_is_not_seen(predict, batch):
     before = predict(batch, ASKED)
     later = batch.replace(frames=batch.frames.at[:, :, 2:].set(7), force_n=batch.force_n.at[:, :, 2:].set(7.0))
@@ -89,7 +90,6 @@ def test_questions_stay_within_the_clip(batch):
         draw_asked(keys[0], batch, (1, 4))
 
 
-@pytest.mark.long
 def test_frames_are_learned_by_heart(state, batch):
     step, state = make_video_step(CONFIG, OPTIMIZER), jax.tree.map(jnp.array, state)
     skills = []

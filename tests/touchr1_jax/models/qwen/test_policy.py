@@ -95,6 +95,7 @@ def test_untouched_policy_is_the_model(batch):
     np.testing.assert_allclose(ours[:, WRITABLE], theirs, rtol=0, atol=1e-5 * float(np.abs(theirs).max()))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("what", ["touch", "view", "time"])
 def test_what_is_felt_and_seen_reaches_the_logits(batch, what):
     f = batch.features

@@ -80,6 +80,7 @@ def test_parameters_fix_the_precision(params):
     assert jnp.linalg.norm(ours.astype(jnp.float32) - whole) < 0.1 * jnp.linalg.norm(whole)
 
 
+@pytest.mark.long
 def test_patches_must_be_those_of_the_grids(params):
     with pytest.raises(ValueError, match=r"patches are \(32, 24\), grids \(\(1, 4, 4\),\) have \(16, 24\)"):
         QwenVision(CONFIG).apply({"params": params}, patches(GRID), (Grid(1, 4, 4),))

@@ -89,6 +89,7 @@ def test_kernels_lie_with_inputs_first(expected, weights):
     np.testing.assert_array_equal(expected["decoder"]["head"]["kernel"], weights["lm_head.weight"].T)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rename", [dict, new_names])
 @pytest.mark.parametrize("sharded", [False, True])
 def test_every_layout_gives_the_same_parameters(tmp_path, weights, expected, rename, sharded):
