@@ -142,6 +142,7 @@ def test_plain_arrays_are_enough_and_misfits_are_named(asked):
             asked.ask(wrong, "How hard is it?")
 
 
+@pytest.mark.long
 def test_inputs_are_read_as_training_data_are(asked, tmp_path):
     for n in range(6):
         cv2.imwrite(str(tmp_path / f"{n}.png"), np.full((24, 32, 3), 40 * n, np.uint8))
@@ -164,6 +165,7 @@ def test_inputs_are_read_as_training_data_are(asked, tmp_path):
     assert np.array_equal(again.touch.frames["tac3d"], drawn.touch.frames["tac3d"])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("source", "message"),
     [
@@ -231,6 +233,7 @@ def test_what_cannot_be_asked_is_one_line(runs, records, capsys):
         assert "Traceback" not in error
 
 
+@pytest.mark.long
 def test_notes_and_levels_of_another_version_are_named_or_left_out(asked):
     for scenes in ([1], "x", {"image_px": "a"}):
         odd = dataclasses.replace(asked.saved, notes={"scenes": scenes})
@@ -266,6 +269,7 @@ def test_a_damaged_result_is_named_where_its_card_is_written(runs, tmp_path, cap
     results.write_text(before)
 
 
+@pytest.mark.long
 def test_a_card_takes_the_figures_of_a_run_of_an_earlier_version_and_of_no_other(runs, tmp_path):
     (tmp_path / "policies" / "sft" / "0").mkdir(parents=True)
     found = json.loads((runs / "trial" / "latest" / "results.json").read_text())
@@ -376,6 +380,7 @@ def test_numbers_and_places_that_nobody_means_are_refused_before_anything_is_rea
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_the_demo_is_closed_to_other_pages_and_files(address, records):
     assert fetch(address, Host="evil.example:80")[0] == 403
     assert fetch(address, "video?name=a.avi", b"x", Origin="http://evil.example")[0] == 403
@@ -398,6 +403,7 @@ def test_policies_of_the_package_are_small_and_have_a_card(name):
     assert {"limits", "measured"} <= load_policy(name).saved.notes.keys()
 
 
+@pytest.mark.long
 def test_requests_of_no_browser_are_refused_without_a_word_in_the_terminal(address, capfd):
     """Lengths that are none, an upload that ends early, a name that is no file's, addresses that are none."""
     split = urllib.parse.urlsplit(address)

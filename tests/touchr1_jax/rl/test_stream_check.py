@@ -8,6 +8,8 @@ import pytest
 from tests.touchr1_jax import tiny
 from touchr1_jax.rl.stream_check import ROUNDING_NAT, check_streams, stream_influence
 
+pytestmark = pytest.mark.long
+
 P, LENGTH = 3, 3
 BATCH = tiny.question_batch(0, P)
 NOISE = jnp.asarray(np.random.default_rng(1).normal(size=(2, *BATCH.features.touch.shape[1:])), jnp.float32)
@@ -22,7 +24,6 @@ def influence():
     return jax.jit(run)
 
 
-@pytest.mark.long
 def test_every_stream_that_is_read_moves_the_answers(influence):
     size, present = jax.device_get(influence(BATCH, NOISE))
     assert present.all()
@@ -30,7 +31,6 @@ def test_every_stream_that_is_read_moves_the_answers(influence):
     check_streams(size, present)
 
 
-@pytest.mark.long
 def test_a_stream_of_constants_is_refused(influence):
     """Touch and noise of stream 1 end in the same tokens, as behind an encoder that is not connected."""
     wire = lambda x: x.at[:, 1].set(0.5)

@@ -18,6 +18,8 @@ from touchr1_jax.models.qwen.model import QwenVL, abstract_params
 from touchr1_jax.models.qwen.peft import load_adapters, save_adapters
 from touchr1_jax.models.qwen.safetensors import read_header, read_tensor, write_file
 
+pytestmark = pytest.mark.long
+
 NAME = "mixed"
 CONFIG = tiny.config_of(CASES[NAME])
 LORA = LoraConfig(rank=3, alpha=5.0, rank_stabilised=True, vision_targets=("qkv", "proj", "gate", "merger_in"))
@@ -37,7 +39,6 @@ def folder(tmp_path):
     return tmp_path
 
 
-@pytest.mark.long
 def test_names_and_factors_by_hand(folder):
     """The first of two layers is a row of a stack, the last stands alone; PEFT's factors are [r, in] and [out, r]."""
     header, found = read_header(folder / "adapter_model.safetensors"), loud()
@@ -56,7 +57,6 @@ def test_names_and_factors_by_hand(folder):
     assert (told["peft_type"], told["r"], told["lora_alpha"], told["use_rslora"]) == ("LORA", 3, 5.0, True)
 
 
-@pytest.mark.long
 def test_what_was_saved_is_loaded(folder):
     found, lora = load_adapters(folder, CONFIG)
     jax.tree.map(np.testing.assert_array_equal, found, loud())
@@ -168,7 +168,6 @@ def test_peft_computes_the_same_logits_and_writes_what_is_read_again(folder, tmp
     assert dataclasses.replace(lora, targets=LORA.targets, vision_targets=LORA.vision_targets) == LORA
 
 
-@pytest.mark.long
 def test_adapters_of_qwen3_are_named_as_its_modules(tmp_path):
     """The second merger of DeepStack stands alone; MLPs and mergers have layers of one name."""
     config = tiny.config_of(CASES["qwen3_mixed_1"])

@@ -25,6 +25,8 @@ from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.training.sft import SFTBatch, SFTState, make_sft_step
 from touchr1_jax.types import Parsed, Target
 
+pytestmark = pytest.mark.long
+
 P, G, T = 2, 2, 3
 WRITABLE = np.flatnonzero(~TOKENIZER.banned)
 LORA = LoraConfig(rank=4, alpha=8.0)
@@ -49,13 +51,11 @@ def completions(*shape: int) -> jax.Array:
     return jnp.asarray(np.random.default_rng(0).choice(WRITABLE, shape), jnp.int32)
 
 
-@pytest.mark.long
 def test_view_fills_its_tokens(batch):
     assert VIEW_TOKENS == LAYOUT.view.size == 4
     assert batch.features.view.shape == (P, VIEW_TOKENS, CONFIG.decoder.hidden_size)
 
 
-@pytest.mark.long
 def test_positions_are_those_of_the_model(batch):
     """Block by block: words, the view, and each stream at its integer frame indices."""
     features = jax.tree.map(lambda x: x[1], batch.features)
@@ -72,7 +72,6 @@ def test_positions_are_those_of_the_model(batch):
     np.testing.assert_array_equal(ours[:, mask], position_ids(runs))
 
 
-@pytest.mark.long
 def test_untouched_policy_is_the_model(batch):
     """Without streams, the logits of a completion are those of `QwenVL` on the same conversation with a picture."""
     params, features = small_policy.params(), batch.features
@@ -95,7 +94,6 @@ def test_untouched_policy_is_the_model(batch):
     np.testing.assert_allclose(ours[:, WRITABLE], theirs, rtol=0, atol=1e-5 * float(np.abs(theirs).max()))
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("what", ["touch", "view", "time"])
 def test_what_is_felt_and_seen_reaches_the_logits(batch, what):
     f = batch.features
@@ -131,7 +129,6 @@ def score(tokens: jax.Array, target: Target) -> tuple[jax.Array, dict[str, jax.A
     return right, {"right": right}, parsed
 
 
-@pytest.mark.long
 def test_one_grpo_step(batch):
     """With adapters on a frozen decoder: finite, on policy, at the reference, and every layer moves."""
     base = {"decoder": small_policy.params()["decoder"]}
@@ -164,7 +161,6 @@ def sft_batch() -> SFTBatch:
     )
 
 
-@pytest.mark.long
 def test_sft_with_adapters_and_a_whole_tactile_encoder():
     """What was pretrained stands still, an argument of the step; adapters and tactile encoder learn the answers."""
     params = small_policy.params()
@@ -185,7 +181,6 @@ def test_sft_with_adapters_and_a_whole_tactile_encoder():
     assert all(jax.tree.leaves(moved))
 
 
-@pytest.mark.long
 def test_half_precision_decodes_as_the_learner_scores(batch):
     """Keys and values of a bfloat16 decoder are bfloat16; both ways agree to its rounding."""
     half = jax.tree.map(lambda x: (0.5 * x).astype(jnp.bfloat16), {"decoder": small_policy.params()["decoder"]})
@@ -204,7 +199,6 @@ def test_half_precision_decodes_as_the_learner_scores(batch):
     np.testing.assert_allclose(step[WRITABLE], scored[WRITABLE], atol=0.02 * float(jnp.abs(scored[WRITABLE]).max()))
 
 
-@pytest.mark.long
 def test_pretrained_towers_stand_beside_fresh_ones():
     params = small_policy.params()
     model = {"vision": params["vision"]["tower"], "decoder": params["decoder"]}
@@ -219,7 +213,6 @@ def test_pretrained_towers_stand_beside_fresh_ones():
         init_on_pretrained(*of, {**model, "decoder": {}})
 
 
-@pytest.mark.long
 def test_view_sizes_are_checked():
     view = QwenViewConfig(tower_config=CONFIG.vision, height_px=33, width_px=15, budget=PixelBudget(least=64, most=512))
     assert (view.size, view.grid, view.tokens) == ((32, 16), 2, 8)
