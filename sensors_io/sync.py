@@ -21,7 +21,8 @@ class ClockMap:
     """Maps the stamps of one device to the host's clock by the running minimum of their difference.
 
     A clock stands still or runs slow if, within a second, it fell behind by over 3 % and all samples came over ¼ s late
-    by it.  Samples then have the time of their arrival, until one came sooner and its time is not before the last.
+    by it.  Samples then have the time of their arrival, until one came sooner and its time is not before the last.  One
+    of the same stamp as the last has it too: no clock tells one time twice.
 
     Args:
       window_s: how long a difference is remembered.
@@ -54,7 +55,7 @@ class ClockMap:
             self._rising.clear()
             self._second, self.slow = None, False
             self.restarts += 1
-        self._last_device_ns = device_ns
+        stands, self._last_device_ns = device_ns == self._last_device_ns, device_ns
         difference = host_ns - device_ns
         while self._rising and self._rising[-1][1] >= difference:
             self._rising.pop()
@@ -63,7 +64,7 @@ class ClockMap:
             self._rising.popleft()
         self._judge(difference, host_ns)
         taken_ns = device_ns + self._rising[0][1]
-        if self.slow or (self._arrived_ns is not None and taken_ns < self._arrived_ns):
+        if stands or self.slow or (self._arrived_ns is not None and taken_ns < self._arrived_ns):
             self._arrived_ns = host_ns
             return host_ns
         self._arrived_ns = None

@@ -304,7 +304,7 @@ class Intake:
         last, self._stamps = self._stamps, (stamp, host)
         if last is not None:
             moved = (stamp - last[0]) - (host - last[1])
-            back = stamp < last[0]
+            back = stamp <= last[0]
             if anew or back or self._back or abs(moved) > _CLOCK_SET_NS:  # after one wrong stamp comes a right one
                 gaps.shift(moved)
             self._back = back
@@ -328,8 +328,6 @@ class Intake:
         last = self._newest
         if last is None or last.frame is None or sample.frame is None or last.frame.shape != sample.frame.shape:
             return False
-        if sample.device_time_ns is not None and sample.device_time_ns == last.device_time_ns:
-            return True
         row = sample.frame.shape[0] // 2
         if not np.array_equal(sample.frame[row], last.frame[row]):  # spares comparing all of nearly every picture
             return False

@@ -139,7 +139,8 @@ _BROKEN = (*MALFORMED, pickle.UnpicklingError, EOFError, tokenize.TokenError)
 class _DataUnpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in _ALLOWED:
-            raise PickleError(f"asks for {module}.{name}: only numbers, text and arrays are read")
+            wanted = ascii(f"{module}.{name}")[1:-1]  # on one line, whatever the file has it be
+            raise PickleError(f"asks for {wanted:.100}: only numbers, text and arrays are read")
         return _ALLOWED[module, name]
 
 
@@ -164,7 +165,7 @@ def read_pickle(path: pathlib.Path) -> Any:
     except PickleError:
         raise
     except _BROKEN as error:
-        raise PickleError(f"{path.name} is damaged ({error!r})") from error
+        raise PickleError(f"{path.name} is damaged ({error!r:.200})") from error
 
 
 def _load(stream: io.BytesIO) -> Any:

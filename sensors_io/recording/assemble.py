@@ -125,8 +125,10 @@ def _backgrounds(start: Mapping[str, Any], entries: Seq[JournalEntry]) -> dict[s
     found: dict[str, np.ndarray] = {}
     for i, stream in enumerate(start["streams"]):
         pictures = [e.arrays[f"background_{i}"] for e in entries if f"background_{i}" in e.arrays]
-        if pictures:
-            found[stream["identity"]["sensor"]] = pictures[0]
+        for picture in pictures[:1]:
+            if picture.dtype != np.uint8 or picture.shape[2:] != (3,) or not picture.size:
+                raise ValueError(f"background_{i} is {picture.dtype}{list(picture.shape)}: must be uint8 [H, W, 3]")
+            found[stream["identity"]["sensor"]] = picture
     return found
 
 

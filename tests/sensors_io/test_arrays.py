@@ -40,6 +40,13 @@ def test_what_is_no_array_is_refused(tmp_path, data, message):
     refused(ArraysError, message, load_arrays, tmp_path / "a.npy")
 
 
+def test_a_refusal_is_one_line_and_does_not_say_how_to_trust_the_file(tmp_path):
+    (tmp_path / "a.npy").write_bytes(npy(" " * 60_000))
+    with pytest.raises(ArraysError, match="Header info length") as told:
+        load_arrays(tmp_path / "a.npy")
+    assert "\n" not in str(told.value)
+
+
 def test_two_arrays_of_one_name_are_refused(tmp_path):
     np.savez(tmp_path / "x.npz", a=np.zeros(2))
     with zipfile.ZipFile(tmp_path / "x.npz", "a") as archive, archive.open("a", "w") as file:

@@ -52,6 +52,15 @@ def test_a_clock_that_stands_still_or_runs_slow_is_left_for_the_arrival(rate):
     assert not clock.slow  # the clock has restarted
 
 
+@pytest.mark.parametrize("anew_s", [0.0, 0.7])
+def test_a_clock_that_stands_still_for_some_samples_is_left_for_the_arrival_at_once(anew_s):
+    """It goes on where it would be, or `anew_s` behind."""
+    clock, arrival = ClockMap(), np.arange(0, 3 * NS_PER_S, 33 * MS)
+    device = arrival - np.where(arrival > 2 * NS_PER_S, round(anew_s * NS_PER_S), 0)
+    device[30:50] = device[30]
+    assert np.array_equal([clock.to_host_ns(int(d), int(h)) for d, h in zip(device, arrival, strict=True)], arrival)
+
+
 @pytest.mark.parametrize(("rate", "slow"), [(0.972, False), (0.965, True)])
 def test_a_clock_is_slow_that_falls_behind_by_more_than_3_percent(rate, slow):
     clock = ClockMap()

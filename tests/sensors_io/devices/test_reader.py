@@ -96,6 +96,19 @@ def test_without_a_counter_the_same_picture_is_a_duplicate_and_the_period_tells_
     assert len(drain(intake)) == 4
 
 
+def test_a_camera_whose_stamps_stand_still_loses_no_picture():
+    noise = np.random.default_rng(0).integers(0, 256, (90, 4, 4, 3), dtype=np.uint8)
+    times = [10 * k for k in range(90) if k != 7]
+    stamps = [10 * k if k < 5 or k > 60 else 50 for k in range(90) if k != 7]
+    script = [
+        sample(None, t, frame=picture, device_time_ns=stamp * MS)
+        for t, stamp, picture in zip(times, stamps, noise, strict=False)
+    ]
+    intake = pumped(Scripted(script, period_s=0.01))
+    assert (intake.counts.duplicates, intake.counts.missing) == (0, 1)
+    assert [s.host_time_ns // MS for s in drain(intake)] == times
+
+
 @pytest.mark.parametrize("refusal", [DeviceNotFoundError, DeviceDataError], ids=["absent", "still starting"])
 def test_a_lost_device_is_opened_again_with_growing_waits(refusal):
     script = [sample(0), DeviceLostError("unplugged"), sample(7), sample(8)]

@@ -304,6 +304,16 @@ def test_a_journal_with_an_entry_that_nothing_reads_is_named(tmp_path, kind, str
 
 
 @pytest.mark.parametrize(
+    "picture", [np.zeros((4, 6, 3), np.float32), np.zeros((4, 6), np.uint8), np.zeros((0, 6, 3), np.uint8)]
+)
+def test_a_journal_whose_background_is_no_picture_is_named(tmp_path, picture):
+    with JournalWriter(tmp_path / "a.journal") as journal:
+        journal.append("start", {"streams": [{"identity": {"sensor": "xense"}}], "key": {}}, background_0=picture)
+        journal.append("frame", {"stream": 0, "time_ns": 1, "index": 0})
+    refused(JournalError, r"another layout .*background_0 is .*: must be uint8", assemble, tmp_path / "a.journal")
+
+
+@pytest.mark.parametrize(
     ("start", "said"),
     [
         (3, "an entry of another layout"),
