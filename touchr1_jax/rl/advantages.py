@@ -58,8 +58,9 @@ def best_of(reward: Float[Array, "*p G"], k: int) -> Float[Array, "*p G"]:
     order = jnp.argsort(reward, -1)
     rising = jnp.take_along_axis(reward, order, -1)
     share = share.T / math.comb(group - 1, k - 1)
-    # at the precision of accelerators equal rewards would differ by more than `SPREAD_FLOOR`
-    found = jnp.matmul(rising, jnp.asarray(share, reward.dtype), precision=jax.lax.Precision.HIGHEST)
+    least = rising[..., :1]
+    # of differences, for sums of large equal rewards round, and at the precision of accelerators so do those of ties
+    found = least + jnp.matmul(rising - least, jnp.asarray(share, reward.dtype), precision=jax.lax.Precision.HIGHEST)
     return jnp.take_along_axis(found, jnp.argsort(order, -1), -1)
 
 

@@ -132,6 +132,16 @@ def test_the_best_of_a_group_is_all_that_counts_where_k_is_its_size():
     assert not advantages(algorithm, reward, {}).any()
 
 
+@pytest.mark.parametrize("k", [2, 4])
+@pytest.mark.parametrize("worth", [300.1, 1000.3, 3e4])
+def test_large_equal_rewards_are_no_signal_for_the_best_of_k_either(worth, k):
+    """A sum of weights of 1 in all times 300 rounds by more than `SPREAD_FLOOR`."""
+    algorithm, reward = Paper(best_of=k), jnp.full((1, 8), worth)
+    np.testing.assert_array_equal(best_of(reward, k), reward)
+    assert no_signal(algorithm, reward, {}).all()
+    assert not advantages(algorithm, reward, {}).any()
+
+
 def test_a_token_is_credited_with_what_is_not_settled_before_it():
     a, b = jnp.array([[1.0, 0.0, 1.0, 0.0]]), jnp.array([[0.0, 0.0, 1.0, 1.0]])
     algorithm = Paper(advantage=Advantage.NONE, segment_credit=True)
