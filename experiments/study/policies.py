@@ -26,6 +26,7 @@ from touchr1_jax.models.saved_policy import (
     PolicyError,
     PolicyInput,
     SavedPolicy,
+    digest_of,
     format_of,
     read_sealed,
     save_policy,
@@ -108,7 +109,11 @@ def require_own(folder: Path, said: object) -> None:
 
 def require_published(folder: Path) -> None:
     """`PolicyError` if the folder of a run lacks its policy, or has a damaged or another one; no network is built."""
-    require_own(folder, read_sealed(folder, format_of(folder) or FORMAT, VERSION)["notes"].get(FILE))
+    config = read_sealed(folder, format_of(folder) or FORMAT, VERSION)
+    for name, digest in config["files"].items():
+        if not (folder / name).is_file() or digest_of(folder / name) != digest:
+            raise PolicyError(f"policy is {folder}: {name} is missing or damaged")
+    require_own(folder, config["notes"].get(FILE))
 
 
 def measured_figures(name: str, runs_dir: Path) -> dict[str, str]:

@@ -109,6 +109,9 @@ def read_adapted(
     """
     config = read_sealed(folder, ADAPTED, VERSION)
     try:
+        for name in (PEFT_CONFIG, PEFT_WEIGHTS, TOUCH_FILE):
+            if not (folder / name).is_file() or digest_of(folder / name) != config["files"][name]:
+                raise PolicyError(f"policy is {folder}: {name} is missing or damaged; copy the folder again")
         released = weights or Path(os.path.normpath(folder / config["weights"]["folder"]))
         if not released.is_dir():
             raise PolicyError(

@@ -182,6 +182,9 @@ def read_policy(folder: Path) -> SavedPolicy:
     """
     config = read_sealed(folder, FORMAT, VERSION)
     try:
+        for name in (SINGLE, TOKENIZER_FILE):
+            if not (folder / name).is_file() or _sha256((folder / name).read_bytes()) != config["files"][name]:
+                raise PolicyError(f"policy is {folder}: {name} is missing or damaged; copy the folder again")
         notes = {**config["notes"]}
         # policies saved before these could be chosen read pictures, and the pixels of a view
         sizes = {**config["model"], "vision": {"stem": "pixels", **config["model"]["vision"]}}
@@ -196,6 +199,8 @@ def read_policy(folder: Path) -> SavedPolicy:
         if tuple(config["sensors"]) != (sensors := tuple(sensor.name for sensor in language.sensors)):
             raise ValueError(f"sensors are {config['sensors']}, its language has {sensors}")
         wanted = jax.eval_shape(functools.partial(policy.init, 0), touch_shapes(model, model.vision.image_px, sensors))
+    except PolicyError:
+        raise
     except MISFITS as error:
         misfit = f"policy is {folder}: its config does not fit this version ({error}); save it anew"
         raise PolicyError(misfit) from error
@@ -285,7 +290,7 @@ def digest_of(path: Path) -> str:
 
 
 def read_sealed(folder: Path, wanted: str, newest: int) -> dict[str, Any]:
-    """Contents of a `config.json` that `seal` wrote, held against its checksum, as are the files that it names.
+    """Contents of a `config.json` that `seal` wrote, held against its checksum.
 
     Args:
       folder: of the policy.
@@ -293,7 +298,7 @@ def read_sealed(folder: Path, wanted: str, newest: int) -> dict[str, Any]:
       newest: the version that is read.
 
     Raises:
-      PolicyError: no such file, another format or version, or a changed file.
+      PolicyError: no such file, another format or version, or changed.
     """
     where = f"policy is {folder}"
     if not (folder / CONFIG_FILE).is_file():
@@ -315,10 +320,6 @@ def read_sealed(folder: Path, wanted: str, newest: int) -> dict[str, Any]:
         raise PolicyError(f"{where}: version is {version}: this code reads {newest}; update touchr1-jax")
     if found.pop(CHECKSUM, None) != _digest(found):
         raise PolicyError(f"{where}: {CONFIG_FILE} was changed after it was written; copy the folder again")
-    files = found.get("files")
-    for name, digest in files.items() if isinstance(files, dict) else [(CONFIG_FILE, None)]:
-        if not (folder / name).is_file() or digest_of(folder / name) != digest:
-            raise PolicyError(f"{where}: {name} is missing or damaged; copy the folder again")
     return found
 
 
