@@ -20,7 +20,17 @@ from touchr1_jax.models.adapted_folder import save_adapted
 from touchr1_jax.models.lora import exported
 from touchr1_jax.models.qwen.config import CONFIG_FILE
 from touchr1_jax.models.released_policy import ReleasedPolicy
-from touchr1_jax.models.saved_policy import PolicyError, PolicyInput, SavedPolicy, save_policy
+from touchr1_jax.models.saved_policy import (
+    FORMAT,
+    VERSION,
+    PolicyError,
+    PolicyInput,
+    SavedPolicy,
+    digest_of,
+    format_of,
+    read_sealed,
+    save_policy,
+)
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.types import Params
 
@@ -95,6 +105,15 @@ def require_own(folder: Path, said: object) -> None:
     """`PolicyError` if a policy in the folder of a run `said` that it is another; earlier versions say nothing."""
     if said and said != (own := runs.labelled(folder.parents[2], "/".join(folder.parts[-3:]))):
         raise PolicyError(f"policy is {folder}: it is of {said}, must be of {own}; put its own copy back")
+
+
+def require_published(folder: Path) -> None:
+    """`PolicyError` if the folder of a run lacks its policy, or has a damaged or another one; no network is built."""
+    config = read_sealed(folder, format_of(folder) or FORMAT, VERSION)
+    for name, digest in config["files"].items():
+        if not (folder / name).is_file() or digest_of(folder / name) != digest:
+            raise PolicyError(f"policy is {folder}: {name} is missing or damaged")
+    require_own(folder, config["notes"].get(FILE))
 
 
 def measured_figures(name: str, runs_dir: Path) -> dict[str, str]:

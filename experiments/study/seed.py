@@ -20,7 +20,7 @@ from experiments.study.alarm_log import alarm_log
 from experiments.study.answers import answers_path, load_answers, save_answers, share_right
 from experiments.study.cache import DAMAGED, cached
 from experiments.study.dataset import Dataset
-from experiments.study.policies import policy_folder, publish_policy
+from experiments.study.policies import policy_folder, publish_policy, require_published
 from experiments.study.stages import (
     EncodedContacts,
     GRPOArm,
@@ -35,6 +35,7 @@ from experiments.study.stages import (
 from experiments.study.training import GRPO_ATTRIBUTES, TrainingConfig
 from sensors_io.schema import ATTRIBUTES, UNKNOWN
 from touchr1_jax.models.policy import Features
+from touchr1_jax.models.saved_policy import PolicyError
 from touchr1_jax.models.touch_policy import TouchPolicy
 from touchr1_jax.rl.config import left_out
 from touchr1_jax.training.evaluation import Evaluation, evaluate_policy
@@ -363,10 +364,18 @@ class SeedTraining(StudySeed):
                 self.context.processes.write_once(lambda: save_answers(self._path(name), evaluation))
 
     def _drop_damaged(self, names: Sequence[str]) -> None:
-        """Remove answers that cannot be read, so that they are made again."""
-        for path in filter(Path.exists, map(self._path, names)):
+        """Remove answers that cannot be read, or whose policy cannot, so that both are made again."""
+        for name in (name for name in names if self._path(name).exists()):
+            path, folder = self._path(name), policy_folder(self.context, name, self.seed)
             try:
                 load_answers(path)
+                if name in (SFT, CONTINUED, *self.arms):
+                    require_published(folder)
+            except PolicyError as error:
+                self.context.print(f"{error}; it is made again, with {path}")
+                if folder.exists():
+                    folder.rename(folder.with_name(f"damaged-{folder.name}"))
+                path.unlink()
             except DAMAGED as error:
                 self.context.print(f"{path} is damaged ({error}), and is made again")
                 path.unlink()

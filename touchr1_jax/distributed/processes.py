@@ -207,11 +207,14 @@ def select_devices(launch: Launch) -> SingleDevice:
     """Select the devices of a run.
 
     Raises:
-      ValueError: the mesh has another number of devices than the processes.
+      MachineError: the mesh has another number of devices than the processes.
     """
     if launch.mesh.devices == 1 and not launch.distributed:
         return SingleDevice()
-    return DeviceMesh(launch.mesh.build())
+    try:
+        return DeviceMesh(launch.mesh.build())
+    except ValueError as error:
+        raise MachineError(f"{error}, such as --mesh.data {jax.device_count()}") from error
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -16,6 +16,7 @@ import jax
 from jax.sharding import AbstractMesh, Mesh, NamedSharding, PartitionSpec
 
 from touchr1_jax.distributed.mesh import DATA, FSDP, TENSOR
+from touchr1_jax.models.layers import SizeError
 from touchr1_jax.models.stacked import STACKED
 
 AnyMesh = Mesh | AbstractMesh
@@ -79,7 +80,8 @@ def state_shardings(mesh: AnyMesh, state: Any) -> Any:
       state: arrays, or their shapes and dtypes.
 
     Raises:
-      ValueError: a leaf without a rule, or one of `LARGE_BYTES` that its rule cannot split; the error names its path.
+      ValueError: a leaf without a rule.
+      SizeError: one of `LARGE_BYTES` that its rule cannot split; both name the path.
     """
 
     def place(path: tuple[Any, ...], leaf: Any) -> NamedSharding:
@@ -103,14 +105,14 @@ def batch_shardings(mesh: AnyMesh, batch: Any) -> Any:
     """Sharding of every leaf of a batch, in the same tree: split along its first dimension.
 
     Raises:
-      ValueError: a first dimension that the axes of `ROWS` do not divide.
+      SizeError: a first dimension that the axes of `ROWS` do not divide.
     """
     devices = row_devices(mesh)
 
     def place(path: tuple[Any, ...], leaf: Any) -> NamedSharding:
         name = jax.tree_util.keystr(path, simple=True, separator="/")
         if not leaf.shape or leaf.shape[0] % devices:
-            raise ValueError(
+            raise SizeError(
                 f"batch {name} has shape {leaf.shape}: its first dimension must be a multiple of data · fsdp = "
                 f"{devices}; change the number of prompts or the mesh"
             )
@@ -180,7 +182,7 @@ def _fitted(mesh: AnyMesh, name: str, leaf: Any, axes: tuple[Axis, ...]) -> Part
     fits = [axis is None or size % mesh.shape[axis] == 0 for axis, size in zip(axes, leaf.shape, strict=True)]
     if not all(fits) and math.prod(leaf.shape) * leaf.dtype.itemsize >= LARGE_BYTES:
         at = fits.index(False)
-        raise ValueError(
+        raise SizeError(
             f"parameter {name} has shape {leaf.shape}: dimension {at} must be a multiple of mesh {axes[at]} = "
             f"{mesh.shape[axes[at]]}; choose a divisor of {leaf.shape[at]}"
         )

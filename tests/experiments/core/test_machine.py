@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from jax.experimental import multihost_utils
@@ -16,7 +17,8 @@ from rich.console import Console
 
 from experiments.core.context import Context
 from experiments.core.metric_log import read_metrics
-from experiments.core.runner import Experiment, run_experiment
+from experiments.core.runner import Experiment, main, run_experiment
+from experiments.faults.trainings import PACKAGE
 from tests.experiments.fakes import coin
 from touchr1_jax.distributed.processes import (
     SINGLE_PROCESS,
@@ -185,3 +187,13 @@ def test_an_experiment_in_two_processes_gives_the_figures_of_one(tmp_path, name)
     one, both = (json.loads((folder / "results.json").read_text()) for folder in latest)
     assert (one["arms"], one["baselines"]) == (both["arms"], both["baselines"])
     assert len(list((tmp_path / "two" / name).iterdir())) == 2  # one run, and `latest`
+
+
+def test_a_mesh_of_more_devices_than_there_are_is_one_line(tmp_path, capsys):
+    """Before, it ended in a traceback, as did `--distributed` without a mesh."""
+    folders = ["--runs-dir", str(tmp_path / "runs"), "--cache-dir", str(tmp_path / "cache")]
+    many = jax.device_count() + 1
+    code = main(["small_study", "--scale", "short", "--mesh.data", str(many), *folders], package=PACKAGE)
+    told = capsys.readouterr()
+    assert code == 1
+    assert f"MachineError: mesh data · fsdp · tensor is {many} · 1 · 1" in told.out + told.err

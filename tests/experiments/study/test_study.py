@@ -1,6 +1,8 @@
 """Answers on disk, answers that need no policy, and settings, rewards and sizes that are refused before any data."""
 
 import dataclasses
+import shutil
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -9,7 +11,8 @@ import pytest
 from experiments.core.artifacts import write_arrays, write_json
 from experiments.core.runner import main
 from experiments.core.runs import FIELDS
-from experiments.study.answers import load_answers, save_answers
+from experiments.study.answers import answers_path, load_answers, save_answers
+from experiments.study.policies import policy_folder, publish_policy, require_published
 from experiments.study.scores import (
     PUBLISHED,
     baselines,
@@ -20,6 +23,7 @@ from experiments.study.scores import (
     score_study,
     study_settings,
 )
+from experiments.study.seed import SeedTraining
 from experiments.study.stages import ProbeFeatures
 from experiments.study.study import CONTINUED, SFT, Study, StudyConfig, check_arms, run_study
 from sensors_io.arrays import ArraysError
@@ -114,6 +118,32 @@ def test_answers_of_another_policy_seed_or_run_are_not_taken(tmp_path, name):
     refused(ArraysError, "put its own copy back", load_answers, mine.rename(tmp_path / name))
     write_arrays(mine, {"contact": np.zeros(3)})
     refused(ArraysError, "lacks attribute", load_answers, mine)
+
+
+@pytest.mark.parametrize("file", ["model.safetensors", "tokenizer.json", "config.json", ""])
+def test_an_unfinished_run_makes_a_damaged_policy_again(policy, params, data, tmp_path, file):
+    """Not only damaged answers: before, the run ended with a policy that nothing could read, and did not say so."""
+    about = {"experiment": "a", "config": {}, "git": {"commit": "", "dirty": False}}
+    write_json(tmp_path / "config.json", dict.fromkeys(FIELDS, "") | about)
+    printed = list[str]()
+    processes = SimpleNamespace(write_once=lambda write: write())
+    context = SimpleNamespace(directory=tmp_path, processes=processes, print=printed.append)
+    publish_policy(policy, params, data, SFT, 0, context)
+    answers, folder = answers_path(context, SFT, 0), policy_folder(context, SFT, 0)
+    save_answers(answers, answers_about(TEST))
+    seed = SimpleNamespace(context=context, seed=0, arms={}, _path=lambda name: answers_path(context, name, 0))
+    SeedTraining._drop_damaged(seed, [SFT])
+    assert not printed
+    assert answers.exists()
+    if file:
+        (folder / file).write_bytes((folder / file).read_bytes()[:-9])
+    else:
+        shutil.rmtree(folder)
+    SeedTraining._drop_damaged(seed, [SFT])
+    assert "it is made again" in printed[0]
+    assert not answers.exists()
+    publish_policy(policy, params, data, SFT, 0, context)
+    require_published(folder)
 
 
 def test_the_joint_mode_is_that_of_whole_rows():

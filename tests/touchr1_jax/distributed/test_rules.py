@@ -14,6 +14,7 @@ from tests.touchr1_jax.distributed.problems import PROBLEMS
 from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.distributed.rules import activation_axes, batch_shardings, gathered_shardings, rule, state_shardings
 from touchr1_jax.models.frame_decoder import FrameDecoder, FrameDecoderConfig
+from touchr1_jax.models.layers import SizeError
 from touchr1_jax.models.lora import LoraConfig, init_adapters
 from touchr1_jax.models.qwen.config import released
 from touchr1_jax.models.qwen.model import abstract_params
@@ -102,14 +103,14 @@ def test_a_parameter_of_another_rank_is_named():
 
 def test_a_large_parameter_that_an_axis_does_not_divide_is_named(seven):
     """3420 hidden channels of the published vision tower over eight devices."""
-    with pytest.raises(ValueError, match=r"blocks/mlp/\w+/\w+ has shape .*multiple of mesh tensor = 8"):
+    with pytest.raises(SizeError, match=r"blocks/mlp/\w+/\w+ has shape .*multiple of mesh tensor = 8"):
         state_shardings(MeshConfig(tensor=8).abstract(), {"vision": {"blocks": seven["vision"]["blocks"]}})
 
 
 def test_a_small_parameter_that_an_axis_does_not_divide_stays_whole_and_a_large_one_is_named():
     kernel = lambda *shape: {"q_proj": {"kernel": jax.ShapeDtypeStruct(shape, jnp.float32)}}
     assert state_shardings(MESH, kernel(6, 6))["q_proj"]["kernel"].spec == P(None, "tensor")
-    with pytest.raises(ValueError, match=r"dimension 0 must be a multiple of mesh fsdp = 4; choose a divisor of 514"):
+    with pytest.raises(SizeError, match=r"dimension 0 must be a multiple of mesh fsdp = 4; choose a divisor of 514"):
         state_shardings(MESH, kernel(514, 512))  # 1 MiB and some
 
 
@@ -119,7 +120,7 @@ def test_batches_are_split_by_their_rows():
 
 
 def test_a_batch_that_does_not_divide_is_an_error():
-    with pytest.raises(ValueError, match=r"batch ids has shape \(6, 4\).*multiple of data · fsdp = 8"):
+    with pytest.raises(SizeError, match=r"batch ids has shape \(6, 4\).*multiple of data · fsdp = 8"):
         batch_shardings(MESH, {"ids": np.zeros((6, 4))})
 
 
