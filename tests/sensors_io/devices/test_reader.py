@@ -123,7 +123,7 @@ def test_stamps_coarser_than_the_period_lose_nothing_and_keep_their_time(rate_hz
     for t, host in zip(taken.tolist(), arrival.tolist(), strict=True):
         intake.offer(Sample(host_time_ns=host, device_time_ns=t // (coarse_ms * MS) * coarse_ms * MS))
     late = np.array([s.host_time_ns for s in intake.drain()]) - taken
-    assert intake.counts.missing <= 2
+    assert intake.counts.missing <= 5
     assert np.abs(late[taken > 2 * NS_PER_S]).max() <= coarse_ms * MS
 
 
