@@ -303,7 +303,7 @@ class Intake:
         host = sample.host_time_ns
         stamp = host if sample.device_time_ns is None else sample.device_time_ns
         last = self._stamps
-        if last is not None and stamp == last[0] and host - last[1] <= _STANDS_NS:
+        if last is not None and stamp == last[0] and not self._back and host - last[1] <= _STANDS_NS:
             return gaps.step(stamp)
         self._stamps = (stamp, host)
         if last is not None:
