@@ -54,7 +54,7 @@ def load_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     except _BROKEN as error:
         if of_system(error):
             raise
-        told = str(error).partition("\n")[0]  # NumPy's further lines say how to trust the file
+        told = str(error).partition("\n")[0][:200]  # NumPy's further lines say how to trust the file
         raise ArraysError(f"{path} cannot be read as arrays ({told}); copy it again from its source") from error
 
 

@@ -22,13 +22,14 @@ class ClockMap:
 
     A clock stands still or runs slow if, within a second, it fell behind by over 3 % and all samples came over ¼ s late
     by it.  Samples then have the time of their arrival, until one came sooner and its time is not before the last.  One
-    of the same stamp as the last has it too: no clock tells one time twice.
+    whose stamp first came over 20 ms ago has it too.
 
     Args:
       window_s: how long a difference is remembered.
     """
 
     _LATE_NS, _BEHIND_NS = NS_PER_S // 4, NS_PER_S * 3 // 100
+    _STANDS_NS = NS_PER_S // 50  # the clock of Windows counts by 15.6 ms
 
     def __init__(self, window_s: float = 10.0):
         if window_s <= 0:
@@ -36,6 +37,7 @@ class ClockMap:
         self._window_ns = round(window_s * NS_PER_S)
         self._rising: collections.deque[tuple[int, int]] = collections.deque()  # (host, difference), both ascending
         self._last_device_ns: int | None = None
+        self._stamp_came_ns = 0  # for the first time
         self._second: _Second | None = None
         self._arrived_ns: int | None = None  # the time of the last sample, if it is that of its arrival
         self.restarts = 0
@@ -55,7 +57,9 @@ class ClockMap:
             self._rising.clear()
             self._second, self.slow = None, False
             self.restarts += 1
-        stands, self._last_device_ns = device_ns == self._last_device_ns, device_ns
+        if device_ns != self._last_device_ns:
+            self._last_device_ns, self._stamp_came_ns = device_ns, host_ns
+        stands = host_ns - self._stamp_came_ns > self._STANDS_NS
         difference = host_ns - device_ns
         while self._rising and self._rising[-1][1] >= difference:
             self._rising.pop()

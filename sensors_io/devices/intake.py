@@ -30,6 +30,7 @@ from sensors_io.devices.errors import (
 from sensors_io.sync import ClockMap, CounterStep, IndexGaps, PeriodGaps
 
 _REPEATED_NS = NS_PER_S // 4  # for which all numbers were seen before: the counter began anew
+_STANDS_NS = NS_PER_S // 4  # for which all stamps were the same: the clock stands still, and is not coarse
 _CLOCK_SET_NS = 10 * NS_PER_S  # between two clocks since the last sample: no buffer holds one back for so long
 
 
@@ -98,7 +99,7 @@ class Intake:
         self._index_gaps = IndexGaps()
         self._period_gaps: PeriodGaps | None = None
         self._period_ns: int | None = None
-        self._stamps: tuple[int, int] | None = None  # of the last sample, on the device's clock and on the host's
+        self._stamps: tuple[int, int] | None = None  # of a last sample, on the device's clock and on the host's
         self._repeated_ns: int | None = None  # arrival of the first repeated number since the last new one
         self._away = self._told_fast = self._overtaken = self._back = False
         self._broken_since = 0  # the last whole sample
@@ -301,7 +302,10 @@ class Intake:
         """By the stamps, whose steps over a clock that was set, or began anew, are those of the host's."""
         host = sample.host_time_ns
         stamp = host if sample.device_time_ns is None else sample.device_time_ns
-        last, self._stamps = self._stamps, (stamp, host)
+        last = self._stamps
+        if last is not None and stamp == last[0] and not self._back and host - last[1] <= _STANDS_NS:
+            return gaps.step(stamp)
+        self._stamps = (stamp, host)
         if last is not None:
             moved = (stamp - last[0]) - (host - last[1])
             back = stamp <= last[0]

@@ -25,6 +25,7 @@ from sensors_io.importers.video import read_video
 from sensors_io.schema import ContactKey
 
 SENSOR = "gelsight_wedge"
+_FORCES = "_forces.pkl"
 _NAME = re.compile(r"([A-Za-z0-9][A-Za-z0-9_.\-]*)_(\d+)")
 
 
@@ -34,10 +35,19 @@ def list_estimate_modulus(source: pathlib.Path, config: ImportConfig) -> Catalog
     Raises:
       ImportSourceError: no .avi there.
     """
-    found = (path for path in inside(source) if path.suffix.lower() == ".avi")
-    videos = sorted(found, key=lambda path: (path.parent, natural(path)))
+    found = list(inside(source))
+    videos = sorted(
+        (path for path in found if path.suffix.lower() == ".avi"), key=lambda path: (path.parent, natural(path))
+    )
     require_files(source, videos, "<object>_<n>.avi with <object>_<n>_forces.pkl")
-    contacts, skipped, trials = [], [], collections.Counter[str]()
+    filmed = {path.with_suffix("") for path in videos}
+    bare = [
+        path
+        for path in found
+        if path.name.endswith(_FORCES) and path.with_name(path.name.removesuffix(_FORCES)) not in filmed
+    ]
+    skipped = [Skip(name=path.relative_to(source).as_posix(), reason="has no .avi") for path in sorted(bare)]
+    contacts, trials = [], collections.Counter[str]()
     for path in videos:
         match, name = _NAME.fullmatch(path.stem), path.relative_to(source).as_posix()
         if match is None:

@@ -1,6 +1,7 @@
 """Comma-separated tables with a header, checked for the columns that an importer needs."""
 
 import csv
+import io
 import pathlib
 from collections.abc import Sequence as Seq
 from typing import TypeVar
@@ -15,19 +16,23 @@ def read_table(path: pathlib.Path, columns: Seq[str]) -> list[dict[str, str]]:
     """Rows of a table by column; a short row has empty cells.
 
     Raises:
-      ImportSourceError: it is absent, is no text, lacks a column, or has no row.
+      ImportSourceError: it is absent, is no text, lacks a column, has no row, or ends in the middle of one.
     """
     _require_file(path)
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file, restval="")
+            text = file.read()
+            reader = csv.DictReader(io.StringIO(text, newline=""))
             missing = [name for name in columns if name not in (reader.fieldnames or ())]
             if missing:
                 raise ImportSourceError(
-                    f"{path} has the columns {reader.fieldnames}: must have {', '.join(columns)}; "
+                    f"{path} has the columns {reader.fieldnames!s:.200}: must have {', '.join(columns)}; "
                     "give the published table"
                 )
-            return _with_a_row(path, list(reader))
+            rows = _with_a_row(path, list(reader))
+            if text[-1] not in "\r\n" and (None in rows[-1].values() or text.count('"') % 2):
+                raise ImportSourceError(f"{path} ends in the middle of row {len(rows)}; give the whole published table")
+            return [{name: cell or "" for name, cell in row.items()} for row in rows]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ImportSourceError(f"{path} cannot be read ({error}); give the published table") from error
 

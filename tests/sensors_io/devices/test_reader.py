@@ -7,7 +7,8 @@ import time
 import numpy as np
 import pytest
 
-from sensors_io.clock import JumpingClock, MonotonicClock
+from sensors_io.clock import NS_PER_S, JumpingClock, MonotonicClock
+from sensors_io.devices.base import Identity, Sample
 from sensors_io.devices.errors import (
     DeviceDataError,
     DeviceLostError,
@@ -106,7 +107,24 @@ def test_a_camera_whose_stamps_stand_still_loses_no_picture():
     ]
     intake = pumped(Scripted(script, period_s=0.01))
     assert (intake.counts.duplicates, intake.counts.missing) == (0, 1)
-    assert [s.host_time_ns // MS for s in drain(intake)] == times
+    assert [
+        t - s.host_time_ns // MS for t, s in zip(times, drain(intake), strict=True) if s.host_time_ns != t * MS
+    ] == [10]
+
+
+@pytest.mark.parametrize(("rate_hz", "coarse_ms"), [(1000, 1), (240, 10), (120, 10)])
+def test_stamps_coarser_than_the_period_lose_nothing_and_keep_their_time(rate_hz, coarse_ms):
+    """A reader is held up for 200 ms in every second."""
+    rng, period = np.random.default_rng(0), round(NS_PER_S / rate_hz)
+    taken = np.cumsum(rng.normal(period, 0.02 * period, 10 * rate_hz).astype(np.int64))
+    arrival = np.where(taken % NS_PER_S < 200 * MS, taken // NS_PER_S * NS_PER_S + 200 * MS, taken)
+    intake = Intake(capacity=len(taken), clock=JumpingClock())
+    intake.opened(Identity(sensor="x", period_s=1 / rate_hz))
+    for t, host in zip(taken.tolist(), arrival.tolist(), strict=True):
+        intake.offer(Sample(host_time_ns=host, device_time_ns=t // (coarse_ms * MS) * coarse_ms * MS))
+    late = np.array([s.host_time_ns for s in intake.drain()]) - taken
+    assert intake.counts.missing <= 5
+    assert np.abs(late[taken > 2 * NS_PER_S]).max() <= coarse_ms * MS
 
 
 @pytest.mark.parametrize("refusal", [DeviceNotFoundError, DeviceDataError], ids=["absent", "still starting"])

@@ -39,8 +39,10 @@ def test_grasps_whose_files_do_not_fit_are_left_out_by_name(tmp_path):
     grasp(source, "ball_4", force=["a"] * 12)
     grasp(source, "ball_1_other")
     grasp(source, "nameless", force=np.ones(12))
+    grasp(source, "ball_5", force=np.ones(12))
+    (source / "ball_5.avi").unlink()
     report, store = imported(list_estimate_modulus(source, EVERYTHING), tmp_path / "out")
     assert len(store) == 1
     videos = {f"{name}.avi" for name in ("ball_1_other", "nameless", "ball_2", "ball_3", "ball_4")}
-    assert {skip.name for skip in report.skipped} == {*videos, "ball_1_widths.pkl"}
+    assert {skip.name for skip in report.skipped} == {*videos, "ball_1_widths.pkl", "ball_5_forces.pkl"}
     assert "gripper_width_m" not in store.contact(0)["gelsight_wedge"].camera

@@ -59,3 +59,21 @@ def test_a_pipe_in_the_place_of_a_table_is_named(tmp_path):
     said = "train.csv cannot be read .it is a folder, a pipe or a device"
     refused(ImportSourceError, said, list_tvl, tmp_path, EVERYTHING)
     refused(ImportSourceError, said, read_rows, tmp_path / "train.csv")
+
+
+@pytest.mark.parametrize("cut", [b",smooth", b'"smooth, har'], ids=["between columns", "in the caption"])
+def test_a_table_that_ends_in_the_middle_of_a_row_is_refused(source, cut):
+    """The rest of a copy that was interrupted: what it would name is gone without a word."""
+    table = source / "data1" / "train.csv"
+    whole = table.read_bytes()
+    table.write_bytes(whole[:-1])  # an editor may leave out the last end of a line
+    assert len(list_tvl(source, EVERYTHING).contacts) == 2
+    table.write_bytes(whole[: whole.rindex(b',"smooth')] + (b"," + cut if cut.startswith(b'"') else b""))
+    refused(ImportSourceError, "train.csv ends in the middle of row 4", list_tvl, source, EVERYTHING)
+
+
+def test_a_table_of_zeros_is_refused_in_a_short_line(source):
+    (source / "data1" / "train.csv").write_bytes(bytes(10_000))
+    with pytest.raises(ImportSourceError, match="has the columns") as told:
+        list_tvl(source, EVERYTHING)
+    assert len(str(told.value).removeprefix(str(source))) < 400
