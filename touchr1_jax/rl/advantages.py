@@ -56,10 +56,10 @@ def best_of(reward: Float[Array, "*p G"], k: int) -> Float[Array, "*p G"]:
     share = np.triu(np.tile([0, *largest], (group, 1)), 1) + np.diag([math.comb(m, k - 1) for m in below])
     order = jnp.argsort(reward, -1)
     rising = jnp.take_along_axis(reward, order, -1)
-    share = jnp.asarray(share / math.comb(group - 1, k - 1), reward.dtype)
+    weight = jnp.asarray(share / math.comb(group - 1, k - 1), reward.dtype)
     least = jnp.maximum(rising, rising[..., k - 1 : k])  # of the rewards that count for a rollout
     # sums of differences, since those of large rewards round, so that equal ones would differ
-    found = least + ((rising[..., None, :] - least[..., None]) * share).sum(-1)
+    found = least + ((rising[..., None, :] - least[..., None]) * weight).sum(-1)
     return jnp.take_along_axis(found, jnp.argsort(order, -1), -1)
 
 
