@@ -51,6 +51,7 @@ from experiments.active.arms import (
     make_policy,
     of_equal_seconds,
     one_step_look_ahead,
+    played_once,
     reinforced,
     warm_params,
     with_dropout,
@@ -175,7 +176,7 @@ def _seed(
     arms = config.arms(seed)
     for name, arm in arms.items():
         compute = functools.partial(reinforced, world, warm, learner, name, arm, seed, context)
-        found |= from_json(context.once(f"played/{name}/{seed}", compute))
+        found |= from_json(played_once(name, seed, compute, context))
         context.print(_line(name, found[name]))
     if seed < config.full_seeds:
         compute = functools.partial(one_step_look_ahead, world, warm, learner, seed, context)

@@ -1,7 +1,7 @@
 """One seed of `active_touch`: warm start, reinforced policies, controls, and their trajectories on test objects."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax.numpy as jnp
@@ -21,12 +21,14 @@ from experiments.active.plans import (
     until_sure,
 )
 from experiments.active.policies import answerer, explore, imitate, part_of, reinforce, single_beliefs, warm_up
-from experiments.active.saved import publish
+from experiments.active.saved import publish, require_published
 from experiments.active.world import TouchWorld
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError
+from experiments.study.policies import fault_of
 from touchr1_jax.models.active_policy import ActivePolicy, build_active_policy
 from touchr1_jax.models.lm import DecoderConfig
+from touchr1_jax.models.saved_policy import PolicyError
 from touchr1_jax.rl.config import GRPOConfig, Norm, Paper
 from touchr1_jax.rl.touch_reward import Prices
 from touchr1_jax.training.exploration import NO_CHOICE, check_exploration, drop_out, touch_batch_of
@@ -226,6 +228,18 @@ def reinforced(
             f"{name}_{MISSING}": lacking,
         }
     )
+
+
+def played_once(name: str, seed: int, compute: Callable[[], Any], context: Context) -> Any:
+    """What `reinforced` saved as a stage; where that is done, but its policy cannot be read, it is made again."""
+    stage = f"played/{name}/{seed}"
+    if context.done(stage):
+        try:
+            require_published(context.directory, name, seed)
+        except PolicyError as error:
+            context.print(f"{fault_of(error)}; it is made again")
+            compute()
+    return context.once(stage, compute)
 
 
 def reinforced_params(

@@ -32,7 +32,7 @@ from experiments.active.policies import answerer, explore
 from experiments.active.world import TouchWorld, restored, stored
 from experiments.core.artifacts import DamagedFileError, jsonable, read_json, write_sealed
 from experiments.core.runs import labelled
-from experiments.study.policies import FILE, POLICIES
+from experiments.study.policies import FILE, POLICIES, require_own
 from sensors_io.json_files import require_regular
 from touchr1_jax.models.active_policy import ActivePolicy, build_active_policy
 from touchr1_jax.models.lm import DecoderConfig
@@ -136,6 +136,13 @@ def publish(
         budget=budget,
     )
     save_explorer(run / POLICIES / name / str(seed), explorer, labelled(run, f"{POLICIES}/{name}/{seed}"))
+
+
+def require_published(run: Path, name: str, seed: int) -> None:
+    """`PolicyError` if a run lacks a policy that `publish` saved, or has a damaged or another one."""
+    folder = run / POLICIES / name / str(seed)
+    read_explorer(folder)
+    require_own(folder, read_json(folder / CONFIG_FILE).get(FILE))
 
 
 def save_explorer(folder: Path, explorer: Explorer, file: str = "") -> None:

@@ -112,8 +112,13 @@ def require_published(folder: Path) -> None:
     config = read_sealed(folder, format_of(folder) or FORMAT, VERSION)
     for name, digest in config["files"].items():
         if not (folder / name).is_file() or digest_of(folder / name) != digest:
-            raise PolicyError(f"policy is {folder}: {name} is missing or damaged")
+            raise PolicyError(f"policy is {folder}: {name} is missing or damaged; copy the folder again")
     require_own(folder, config["notes"].get(FILE))
+
+
+def fault_of(error: PolicyError) -> str:
+    """Its message without the advice at the end, which is for policies that are not made again."""
+    return str(error).rpartition(";")[0] or str(error)
 
 
 def measured_figures(name: str, runs_dir: Path) -> dict[str, str]:
@@ -168,7 +173,7 @@ def run_policy(name: str, runs_dir: Path) -> Path | None:
         arm, seed = [*parts[count:], *["sft", "0"][len(parts) - count :]]
         folder = run / POLICIES / arm / seed
         if not folder.is_dir():
-            saved = sorted(str(p.relative_to(run / POLICIES)) for p in (run / POLICIES).glob("*/*/"))
+            saved = sorted(str(p.relative_to(run / POLICIES)) for p in (run / POLICIES).glob("*/[0-9]*/"))
             has = f"has {', '.join(saved)}" if saved else "has none: it trains none, or is of an earlier version"
             raise PolicyError(f"policy is {name!r}: {run} {has}; name RUN/ARM/SEED, or run the experiment again")
         return folder

@@ -6,6 +6,7 @@ a stopped run continues from its last checkpoint.
 
 import dataclasses
 import functools
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -20,7 +21,7 @@ from experiments.study.alarm_log import alarm_log
 from experiments.study.answers import answers_path, load_answers, save_answers, share_right
 from experiments.study.cache import DAMAGED, cached
 from experiments.study.dataset import Dataset
-from experiments.study.policies import policy_folder, publish_policy, require_published
+from experiments.study.policies import fault_of, policy_folder, publish_policy, require_published
 from experiments.study.stages import (
     EncodedContacts,
     GRPOArm,
@@ -364,21 +365,24 @@ class SeedTraining(StudySeed):
                 self.context.processes.write_once(lambda: save_answers(self._path(name), evaluation))
 
     def _drop_damaged(self, names: Sequence[str]) -> None:
-        """Remove answers that cannot be read, or whose policy cannot, so that both are made again."""
-        for name in (name for name in names if self._path(name).exists()):
+        """Remove answers that cannot be read, and move policies that cannot, so that both are made again."""
+        for name in names:
             path, folder = self._path(name), policy_folder(self.context, name, self.seed)
             try:
-                load_answers(path)
-                if name in (SFT, CONTINUED, *self.arms):
-                    require_published(folder)
-            except PolicyError as error:
-                self.context.print(f"{error}; it is made again, with {path}")
-                if folder.exists():
-                    folder.rename(folder.with_name(f"damaged-{folder.name}"))
-                path.unlink()
+                if path.exists():
+                    load_answers(path)
             except DAMAGED as error:
                 self.context.print(f"{path} is damaged ({error}), and is made again")
                 path.unlink()
+            try:
+                if name in (SFT, CONTINUED, *self.arms) and (path.exists() or folder.exists()):
+                    require_published(folder)
+            except PolicyError as error:
+                self.context.print(f"{fault_of(error)}; it is made again, with {path}")
+                if folder.exists():
+                    places = (folder.with_name(f"damaged-{folder.name}-{i}") for i in itertools.count(1))
+                    folder.rename(next(place for place in places if not place.exists()))
+                path.unlink(missing_ok=True)
 
     def _path(self, name: str) -> Path:
         return answers_path(self.context, name, self.seed)

@@ -214,7 +214,7 @@ def select_devices(launch: Launch) -> SingleDevice:
     try:
         return DeviceMesh(launch.mesh.build())
     except ValueError as error:
-        raise MachineError(f"{error}, such as --mesh.data {jax.device_count()}") from error
+        raise MachineError(f"{error}: --mesh.data, --mesh.fsdp or --mesh.tensor") from error
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

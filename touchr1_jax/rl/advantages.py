@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping
 from typing import assert_never
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -57,10 +56,10 @@ def best_of(reward: Float[Array, "*p G"], k: int) -> Float[Array, "*p G"]:
     share = np.triu(np.tile([0, *largest], (group, 1)), 1) + np.diag([math.comb(m, k - 1) for m in below])
     order = jnp.argsort(reward, -1)
     rising = jnp.take_along_axis(reward, order, -1)
-    share = share.T / math.comb(group - 1, k - 1)
-    least = rising[..., :1]
-    # of differences, for sums of large equal rewards round, and at the precision of accelerators so do those of ties
-    found = least + jnp.matmul(rising - least, jnp.asarray(share, reward.dtype), precision=jax.lax.Precision.HIGHEST)
+    weight = jnp.asarray(share / math.comb(group - 1, k - 1), reward.dtype)
+    least = jnp.maximum(rising, rising[..., k - 1 : k])  # of the rewards that count for a rollout
+    # sums of differences, since those of large rewards round, so that equal ones would differ
+    found = least + ((rising[..., None, :] - least[..., None]) * weight).sum(-1)
     return jnp.take_along_axis(found, jnp.argsort(order, -1), -1)
 
 

@@ -3,12 +3,16 @@
 import dataclasses
 import json
 import os
+import shutil
+from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
 
-from experiments.active.saved import is_explorer, read_explorer, save_explorer
+from experiments.active.arms import played_once
+from experiments.active.saved import is_explorer, read_explorer, require_published, save_explorer
+from experiments.core.runs import labelled
 from tests.experiments.active.explorers import explorer, frames, touching
 from touchr1_jax.models.saved_policy import PolicyError
 
@@ -58,6 +62,29 @@ def test_a_folder_gives_back_the_policy(asking, tmp_path):
 @pytest.fixture(scope="module")
 def drawn():
     return explorer(0)
+
+
+@pytest.mark.parametrize("damage", ["byte", "config", "gone", "another"])
+def test_an_unfinished_run_publishes_a_damaged_policy_again(drawn, tmp_path, damage):
+    """Before, it ended with a policy that nothing could read, or with that of another seed, and did not say so."""
+    publish = lambda: save_explorer(folder, drawn, labelled(tmp_path, "policies/chosen/0"))
+    folder, printed, stages = tmp_path / "policies" / "chosen" / "0", list[str](), {"played/chosen/0": 1}
+    once = lambda stage, compute: stages[stage]
+    context = SimpleNamespace(directory=tmp_path, print=printed.append, done=stages.__contains__, once=once)
+    publish()
+    assert played_once("chosen", 0, pytest.fail, context) == 1
+    if damage == "gone":
+        shutil.rmtree(folder)
+    elif damage == "another":
+        save_explorer(folder, drawn, labelled(tmp_path, "policies/chosen/1"))
+    else:
+        path = folder / ("config.json" if damage == "config" else "model.safetensors")
+        path.write_bytes(path.read_bytes()[:-9])
+    assert played_once("chosen", 0, publish, context) == 1
+    (line,) = printed
+    assert str(folder) in line
+    assert "it is made again" in line
+    require_published(tmp_path, "chosen", 0)
 
 
 @pytest.mark.parametrize("damage", ["byte", "missing", "version"])

@@ -141,9 +141,27 @@ def test_an_unfinished_run_makes_a_damaged_policy_again(policy, params, data, tm
         shutil.rmtree(folder)
     SeedTraining._drop_damaged(seed, [SFT])
     assert "it is made again" in printed[0]
+    assert "copy the folder" not in printed[0]
     assert not answers.exists()
     publish_policy(policy, params, data, SFT, 0, context)
     require_published(folder)
+
+
+def test_a_policy_that_is_damaged_twice_or_has_no_answers_yet_is_made_again(policy, params, data, tmp_path):
+    """Before, the second could not be moved away, and one without answers was refused where it was published."""
+    about = {"experiment": "a", "config": {}, "git": {"commit": "", "dirty": False}}
+    write_json(tmp_path / "config.json", dict.fromkeys(FIELDS, "") | about)
+    processes = SimpleNamespace(write_once=lambda write: write())
+    context = SimpleNamespace(directory=tmp_path, processes=processes, print=lambda line: None)
+    folder = policy_folder(context, SFT, 0)
+    seed = SimpleNamespace(context=context, seed=0, arms={}, _path=lambda name: answers_path(context, name, 0))
+    for _ in range(2):
+        publish_policy(policy, params, data, SFT, 0, context)
+        (folder / "config.json").write_text("{")
+        SeedTraining._drop_damaged(seed, [SFT])
+    publish_policy(policy, params, data, SFT, 0, context)
+    require_published(folder)
+    assert {path.name for path in folder.parent.iterdir()} == {"0", "damaged-0-1", "damaged-0-2"}
 
 
 def test_the_joint_mode_is_that_of_whole_rows():

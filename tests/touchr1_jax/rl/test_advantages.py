@@ -122,7 +122,7 @@ def test_the_best_of_k_is_the_mean_over_all_sets_with_a_rollout(k):
     np.testing.assert_allclose(
         found.mean(-1), [np.mean([row[list(s)].max() for s in sets]) for row in reward], atol=1e-6
     )
-    assert k == 1 or str(jax.make_jaxpr(lambda x: best_of(x, k))(reward)).count("HIGHEST") == 2
+    assert "dot_general" not in str(jax.make_jaxpr(lambda x: best_of(x, k))(reward))  # which accelerators round
 
 
 def test_the_best_of_a_group_is_all_that_counts_where_k_is_its_size():
@@ -140,6 +140,15 @@ def test_large_equal_rewards_are_no_signal_for_the_best_of_k_either(worth, k):
     np.testing.assert_array_equal(best_of(reward, k), reward)
     assert no_signal(algorithm, reward, {}).all()
     assert not advantages(algorithm, reward, {}).any()
+
+
+@pytest.mark.parametrize("k", [2, 3])
+def test_one_very_low_reward_does_not_round_the_best_of_k_of_the_others(k):
+    """It is the largest of no set; before, the others were sums of differences from it, off by up to .05."""
+    reward = np.array([0.1, -1e6, 0.3, 0.2, 0.4, 0.1], np.float32)
+    sets = list(itertools.combinations(range(6), k))
+    expected = [np.mean([reward[list(s)].max() for s in sets if i in s]) for i in range(6)]
+    np.testing.assert_allclose(best_of(jnp.asarray(reward)[None], k)[0], expected, atol=1e-6)
 
 
 def test_a_token_is_credited_with_what_is_not_settled_before_it():
