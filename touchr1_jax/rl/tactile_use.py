@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 from touchr1_jax import masked
 from touchr1_jax.models.policy import Features
 from touchr1_jax.rewards.accuracy import accuracy
-from touchr1_jax.rl.advantages import advantages, of_kept_groups, zero_variance
+from touchr1_jax.rl.advantages import SPREAD_FLOOR, advantages, of_kept_groups, zero_variance
 from touchr1_jax.rl.config import Algorithm, TactileUse
 from touchr1_jax.rl.counterfactual import Perturbed, drop_touch, noise_touch, shuffle_touch, swap_touch
 from touchr1_jax.rl.rollout import GRPOBatch
@@ -146,11 +146,16 @@ def literal(
     own: Float[Array, "G"], best: Float[Array, ""], is_right: Bool[Array, "G"], margin: float
 ) -> Float[Array, "G"]:
     """1[s̄ > b + δ] · 1[d_i = 0]."""
-    return ((jnp.mean(own) > best + margin) & is_right).astype(jnp.float32)
+    return (leads(own, best, margin) & is_right).astype(jnp.float32)
 
 
 def recommended(
     own: Float[Array, "G"], best: Float[Array, ""], formatted: Bool[Array, "G"], margin: float | Array
 ) -> Float[Array, "G"]:
     """1[s̄ > b + δ] · 1[formatted_i] · max(0, s_i − b)."""
-    return jnp.where((jnp.mean(own) > best + margin) & formatted, jnp.maximum(own - best, 0.0), 0.0)
+    return jnp.where(leads(own, best, margin) & formatted, jnp.maximum(own - best, 0.0), 0.0)
+
+
+def leads(own: Float[Array, "G"], best: Float[Array, ""], margin: float | Array) -> Bool[Array, ""]:
+    """s̄ > b + δ, by more than the rounding of equal means of different rollouts."""
+    return jnp.mean(own) > best + margin + SPREAD_FLOOR

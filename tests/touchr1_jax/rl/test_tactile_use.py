@@ -1,5 +1,7 @@
 """R_tu by hand, and how often it pays by chance, enumerated."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -70,6 +72,17 @@ def test_recommended_by_hand():
 def test_literal_by_hand():
     own, is_right = jnp.array([1.0, 0.4, 0.0, 1.0]), jnp.array([True, False, False, True])
     np.testing.assert_array_equal(literal(own, jnp.array(0.3), is_right, 0.1), [1, 0, 0, 1])
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.1])
+def test_a_lead_of_just_the_margin_is_none_however_means_round(margin):
+    """Groups of 8 and controls of 4 in tenths: of these 675 pairs, float32 alone called some of both margins paid."""
+    spreads = lambda n: np.array(list(itertools.combinations_with_replacement([0, 4, 10], n)))
+    own, control = spreads(8), spreads(4)
+    pays = lambda own, control: literal(own, jnp.mean(control), jnp.ones(8, bool), margin).any()
+    found = jax.vmap(lambda own: jax.vmap(lambda control: pays(own, control))(control / 10))(own / 10)
+    lead = own.sum(-1)[:, None] - 2 * control.sum(-1)  # in eightieths
+    np.testing.assert_array_equal(found, lead > 80 * margin)
 
 
 def test_nothing_right_earns_nothing():
