@@ -231,7 +231,7 @@ def reinforced(
 
 
 def played_once(name: str, seed: int, compute: Callable[[], Any], context: Context) -> Any:
-    """What `reinforced` saved as a stage; where that is done, but its policy cannot be read, it is made again."""
+    """Stage that `reinforced` saved; where it is done, but its policy cannot be read, it is made again."""
     stage = f"played/{name}/{seed}"
     if context.done(stage):
         try:
