@@ -155,7 +155,8 @@ def test_adapters_learn_from_rows_what_they_learn_from_padding(params, batch):
     adapters = jax.tree.map(lambda x: 0.1 + x, init_adapters(jax.random.key(0), params, lora))
     trained = {"adapters": adapters, "tactile": params["tactile"]}
     found = jax.jit(functools.partial(sft_gradient, fns))
-    assert_same(found(trained, packed(batch, Packing(width=WIDTH, contacts=4))), found(trained, batch))
+    of_rows, of_padding = found(trained, packed(batch, Packing(width=WIDTH, contacts=4))), found(trained, batch)
+    assert_same(of_rows, of_padding, tolerance=1e-4)  # so large adapters round by 4e-5 on some processors
 
 
 @pytest.fixture(scope="module")
