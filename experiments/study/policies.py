@@ -26,9 +26,9 @@ from touchr1_jax.models.saved_policy import (
     PolicyError,
     PolicyInput,
     SavedPolicy,
-    digest_of,
     format_of,
     read_sealed,
+    require_files,
     save_policy,
 )
 from touchr1_jax.models.touch_policy import TouchPolicy
@@ -110,9 +110,7 @@ def require_own(folder: Path, said: object) -> None:
 def require_published(folder: Path) -> None:
     """`PolicyError` if the folder of a run lacks its policy, or has a damaged or another one; no network is built."""
     config = read_sealed(folder, format_of(folder) or FORMAT, VERSION)
-    for name, digest in config["files"].items():
-        if not (folder / name).is_file() or digest_of(folder / name) != digest:
-            raise PolicyError(f"policy is {folder}: {name} is missing or damaged; copy the folder again")
+    require_files(folder, config["files"], config["files"])
     require_own(folder, config["notes"].get(FILE))
 
 

@@ -44,6 +44,7 @@ from touchr1_jax.models.saved_policy import (
     read_policy,
     read_sealed,
     rebuilt,
+    require_files,
     seal,
 )
 from touchr1_jax.models.stacked import ADAPTERS
@@ -109,9 +110,7 @@ def read_adapted(
     """
     config = read_sealed(folder, ADAPTED, VERSION)
     try:
-        for name in (PEFT_CONFIG, PEFT_WEIGHTS, TOUCH_FILE):
-            if not (folder / name).is_file() or digest_of(folder / name) != config["files"][name]:
-                raise PolicyError(f"policy is {folder}: {name} is missing or damaged; copy the folder again")
+        require_files(folder, config["files"], (PEFT_CONFIG, PEFT_WEIGHTS, TOUCH_FILE))
         released = weights or Path(os.path.normpath(folder / config["weights"]["folder"]))
         if not released.is_dir():
             raise PolicyError(

@@ -182,9 +182,7 @@ def read_policy(folder: Path) -> SavedPolicy:
     """
     config = read_sealed(folder, FORMAT, VERSION)
     try:
-        for name in (SINGLE, TOKENIZER_FILE):
-            if not (folder / name).is_file() or _sha256((folder / name).read_bytes()) != config["files"][name]:
-                raise PolicyError(f"policy is {folder}: {name} is missing or damaged; copy the folder again")
+        require_files(folder, config["files"], (SINGLE, TOKENIZER_FILE))
         notes = {**config["notes"]}
         # policies saved before these could be chosen read pictures, and the pixels of a view
         sizes = {**config["model"], "vision": {"stem": "pixels", **config["model"]["vision"]}}
@@ -262,7 +260,7 @@ def _yes(value: bool) -> str:
 
 def _config(saved: SavedPolicy, precision: Precision, folder: Path) -> dict[str, Any]:
     """Contents of `config.json`, with the checksums of the files that are in the folder."""
-    fields: dict[str, Any] = {
+    return {
         "model_type": FORMAT,
         "version": VERSION,
         "precision": precision,
@@ -272,9 +270,8 @@ def _config(saved: SavedPolicy, precision: Precision, folder: Path) -> dict[str,
         "questions": {a.name: saved.questions[a.name] for a in saved.policy.language.attributes},
         "input": dataclasses.asdict(saved.reads),
         "notes": dict(saved.notes),
-        "files": {name: _sha256((folder / name).read_bytes()) for name in (SINGLE, TOKENIZER_FILE)},
+        "files": {name: digest_of(folder / name) for name in (SINGLE, TOKENIZER_FILE)},
     }
-    return fields
 
 
 def seal(fields: Mapping[str, Any]) -> str:
@@ -286,7 +283,14 @@ def seal(fields: Mapping[str, Any]) -> str:
 
 def digest_of(path: Path) -> str:
     """SHA-256 of a file."""
-    return _sha256(path.read_bytes())
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def require_files(folder: Path, digests: Mapping[str, str], names: Collection[str]) -> None:
+    """`PolicyError` that names a file of a policy which is missing or has another digest."""
+    for name in names:
+        if not (folder / name).is_file() or digest_of(folder / name) != digests[name]:
+            raise PolicyError(f"policy is {folder}: {name} is missing or damaged; copy the folder again")
 
 
 def read_sealed(folder: Path, wanted: str, newest: int) -> dict[str, Any]:
@@ -393,8 +397,4 @@ def rebuilt(kind: Any, value: Any) -> Any:
 
 
 def _digest(fields: Mapping[str, Any]) -> str:
-    return _sha256(json.dumps(fields, sort_keys=True).encode())
-
-
-def _sha256(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
+    return hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()
