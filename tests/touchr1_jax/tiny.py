@@ -71,7 +71,13 @@ def shallow_params(seed: int = 0, *, loud: float = 0.4) -> Params:
 @functools.cache
 def params(seed: int = 0, *, loud: float = 0.4) -> Params:
     """Loud parameters of `FNS`."""
-    return draw_params(jax.eval_shape(lambda: initialise(jax.random.key(0))), seed, loud=loud)
+    return draw_params(shapes(), seed, loud=loud)
+
+
+@functools.cache
+def shapes() -> Params:
+    """Shapes of the parameters of `FNS`."""
+    return jax.eval_shape(lambda: initialise(jax.random.key(0)))
 
 
 def initialise(key: jax.Array) -> Params:

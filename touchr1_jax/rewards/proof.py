@@ -72,34 +72,30 @@ def _values(reward: Reward | GroupReward, answers: Parsed, targets: Target, leng
 
 
 def _answers(sensors: int, attributes: int) -> Parsed:
-    spread = jnp.where(jnp.arange(sensors) % 2 == 0, 0, 1)[:, None]
-    rows = [
-        Parsed(
-            perceive=jnp.broadcast_to(spread if level == 1 else level, (sensors, attributes)),
-            compare=jnp.full(attributes, level),
-            conclude=jnp.full(attributes, level),
-            formatted=jnp.array(formatted),
-            truncated=jnp.array(truncated),
-            length=jnp.array(length),
-        )
-        for level, formatted, truncated, length in itertools.product(
-            (-1, 0, 1, 2), (False, True), (False, True), (0, 1, 20)
-        )
-    ]
-    return jax.tree.map(lambda *x: jnp.stack(x), *rows)
+    cases = itertools.product((-1, 0, 1, 2), (False, True), (False, True), (0, 1, 20))
+    level, formatted, truncated, length = (np.array(x) for x in zip(*cases, strict=True))
+    slots = np.tile(level[:, None], attributes)
+    disagreeing = np.arange(sensors)[:, None] % 2
+    return Parsed(
+        perceive=jnp.asarray(np.where(slots[:, None] == 1, disagreeing, slots[:, None])),
+        compare=jnp.asarray(slots),
+        conclude=jnp.asarray(slots),
+        formatted=jnp.asarray(formatted),
+        truncated=jnp.asarray(truncated),
+        length=jnp.asarray(length),
+    )
 
 
 def _targets(sensors: int, attributes: int) -> Target:
-    rows = [
-        Target(
-            asked=jnp.arange(attributes) < asked,
-            label=jnp.full(attributes, label if label < 2 else levels - 1),
-            levels=jnp.full(attributes, levels),
-            ordinal=jnp.full(attributes, ordinal),
-            streams=jnp.arange(sensors) < streams,
-        )
-        for asked, label, levels, ordinal, streams in itertools.product(
-            (attributes, 1, 0), (0, -1, 2), (3, 2, 9), (True, False), sorted({sensors, 2, 1, 0}, reverse=True)
-        )
-    ]
-    return jax.tree.map(lambda *x: jnp.stack(x), *rows)
+    cases = itertools.product(
+        (attributes, 1, 0), (0, -1, 2), (3, 2, 9), (True, False), sorted({sensors, 2, 1, 0}, reverse=True)
+    )
+    asked, label, levels, ordinal, streams = (np.array(x)[:, None] for x in zip(*cases, strict=True))
+    each = lambda x: jnp.asarray(np.tile(x, attributes))
+    return Target(
+        asked=jnp.asarray(np.arange(attributes) < asked),
+        label=each(np.where(label < 2, label, levels - 1)),
+        levels=each(levels),
+        ordinal=each(ordinal),
+        streams=jnp.asarray(np.arange(sensors) < streams),
+    )

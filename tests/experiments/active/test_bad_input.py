@@ -47,6 +47,7 @@ CASES = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("names", CASES)
 def test_arms_that_cannot_learn_are_named(names):
     changes, arm, error = CASES[names]

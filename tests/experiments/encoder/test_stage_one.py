@@ -1,6 +1,7 @@
 """Objectives without labels compared, collapse, and predicted frames: their arithmetic by hand values."""
 
 import numpy as np
+import pytest
 
 from experiments.encoder.pretrain import depth_measures
 from experiments.encoder.stability_encoder import ARMS, CollapseOutcome
@@ -48,6 +49,7 @@ def test_failure_is_defined_at_the_end_and_alarms_during_training():
     assert outcome.first_alarm(1) == 2
 
 
+@pytest.mark.long
 def test_mean_frames_are_means_of_what_was_recorded(data, context):
     rows = data.parts["sft"][:3]
     (clip,) = clip_batches(data.store, rows, data.clip, batch_size=3, seed=0, shuffle=False, repeat=False)

@@ -106,6 +106,7 @@ def test_an_object_is_predicted_by_a_probe_that_never_saw_it(questions):
     assert answers.right.mean() < 0.5
 
 
+@pytest.mark.long
 def test_a_probe_carries_over_what_its_records_taught(questions):
     features, labels, objects = questions
     wrong = features[:, [1, 2, 0]]  # each level looks like another one

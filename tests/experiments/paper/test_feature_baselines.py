@@ -102,6 +102,7 @@ def test_other_objects_are_others_and_all_are_drawn():
         other_objects(np.array(["a", "a"]), 0)
 
 
+@pytest.mark.long
 def test_fields_of_the_strongest_press_are_averaged_over_cells(data):
     rows = data.parts["test"][:2]
     found = field_features(data.store, rows, data.clip.sensors)

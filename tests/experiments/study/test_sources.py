@@ -36,6 +36,7 @@ def test_records_are_taken_as_they_are(records, context):
     assert context.timing() == {}
 
 
+@pytest.mark.long
 def test_records_and_encoders_that_changed_end_a_continued_run(tmp_path, records, policy, params, context):
     copy, file = tmp_path / "copy", tmp_path / "encoder.npz"
     shutil.copytree(records, copy)

@@ -206,6 +206,7 @@ def test_force_that_gives_hardness_away_is_found_out_where_it_is_measured(study)
     assert "force_only" not in baselines(silent)
 
 
+@pytest.mark.long
 def test_every_policy_and_baseline_is_scored_on_the_same_questions(study):
     scored = score_study(study)
     assert list(scored.arms) == list(scored.rows)[:2] == [SFT, CONTINUED]

@@ -49,6 +49,7 @@ def test_real_presses_calibrate(real: pathlib.Path) -> None:
     assert made.made_from["held-out radius error median, %"] < 20
 
 
+@pytest.mark.long
 def test_extract_writes_arrays_over_frames(real: pathlib.Path, tmp_path: pathlib.Path) -> None:
     inputs = [str(CLIPS / f"press_{i}.png") for i in (9, 20)] + [str(CLIPS / "background.png")]
     out = tmp_path / "fields.npz"

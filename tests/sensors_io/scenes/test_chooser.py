@@ -156,6 +156,7 @@ def test_many_scenes_are_solved_as_each_alone() -> None:
             np.testing.assert_allclose(bucket.contacts.displacement_mm[at], alone.displacement_mm, atol=1e-3 * scale)
 
 
+@pytest.mark.long
 def test_resuming_ends_where_solving_does() -> None:
     soft, fine = _spectrum(36, 24), _spectrum(64, 32)
     first = contact.solve(_bumps(24), 3.0, soft, 0 * soft, WINDOW_MM / 24, 3e-2)

@@ -66,6 +66,7 @@ def test_optics_and_touches_are_found_again(presses: BallPictures, profiles: fit
     assert np.abs(flat).mean() < 1e-3
 
 
+@pytest.mark.long
 def test_noise_and_grain_are_found_again(presses: BallPictures) -> None:
     noise = fitting.measure_noise(presses, _touches(), MINI)
     for c in range(3):

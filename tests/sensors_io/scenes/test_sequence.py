@@ -44,6 +44,7 @@ def test_friction_follows_the_slide_and_keeps_to_coulomb(slide):
     assert np.abs(slide.shear_mm[moving]).max() > 5 * np.abs(slide.shear_mm[: 1 + hand.phase.argmax()][0]).max() / 4
 
 
+@pytest.mark.long
 def test_frames_come_on_the_cameras_clock(slide, hold):
     for sequence in (slide, hold):
         assert np.all(np.diff(sequence.host_time_ns) > 0)

@@ -70,6 +70,7 @@ def test_fresh_adapters_change_nothing():
     np.testing.assert_array_equal(GatedMLP(5).apply({"params": base}, x), before)
 
 
+@pytest.mark.long
 def test_adapters_have_the_shapes_of_their_layers(base):
     layer = init_adapters(jax.random.key(0), base, LORA)["decoder"]["last_layer"]
     c = FNS.module.config.decoder
@@ -92,6 +93,7 @@ def test_merged_parameters_compute_the_same(base):
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=2e-5 * float(jnp.abs(theirs[..., tiny.WRITABLE]).max()))
 
 
+@pytest.mark.long
 def test_gradients_are_those_through_the_merged_parameters(base):
     decoder = {"decoder": base["decoder"]}
     inner = loud(init_adapters(jax.random.key(0), decoder, LORA))["decoder"]

@@ -222,6 +222,7 @@ def test_kept_patches_are_the_busy_ones_in_their_places():
     np.testing.assert_array_equal(encode_alone(dataclasses.replace(shallow, patches_kept=2), dull).patches, kept)
 
 
+@pytest.mark.long
 def test_the_rest_is_one_more_token():
     frames = np.random.default_rng(0).uniform(0, 255, (F, H, W, 3)).astype(np.float32)
     merged = jax.eval_shape(lambda x: encode_alone(dataclasses.replace(WIDE, patches_kept=2, rest="merge"), x), frames)

@@ -75,6 +75,7 @@ def products(jaxpr) -> int:
     return sum(eqn.primitive is linear_p for eqn in jaxpr.eqns) + sum(map(products, inner))
 
 
+@pytest.mark.long
 def test_rematerialised_layers_multiply_with_no_weight_twice():
     """The backward pass keeps what they make of weights; of a policy that keeps nothing the count is larger."""
     x, mask = jnp.ones((5, DECODER.hidden_size)), jnp.ones(5, bool)
@@ -118,6 +119,7 @@ def test_the_dense_layer_is_flax_s():
     np.testing.assert_allclose(ours.apply(params, X), theirs.apply(params, X), rtol=1e-6)
 
 
+@pytest.mark.long
 def test_logits_of_the_table_are_flax_s():
     key, query = jax.random.key(0), X
     ours, theirs = Embed(9, 4), nn.Embed(9, 4)

@@ -27,8 +27,9 @@ DIRECTIONS = 8
 """Random directions along which gradients are compared; an error of any parameter is in all of them."""
 
 LOUD = {"beta": 0.3, "gamma": 0.2, "entropy_weight": 0.1}
+PRESETS = {preset.__name__: preset() for preset in get_args(AnyAlgorithm)}
 ALGORITHMS = {
-    **{preset.__name__: preset() for preset in get_args(AnyAlgorithm)},
+    **PRESETS,
     **{f"KL {kl}": Paper(**LOUD, kl=kl) for kl in ("k1", "k2", "k3", "exact")},
     **{f"average {x.value}": Paper(**LOUD, average=x) for x in Average},
     **{f"surrogate {x.value}": Paper(**LOUD, surrogate=x, clip_low=0.1, clip_high=0.15) for x in Surrogate},
@@ -225,17 +226,22 @@ def distance(config: GRPOConfig, *, first: bool, by_token: bool = False, wrong: 
     return float(np.linalg.norm(slopes - exact) / np.linalg.norm(exact))
 
 
+def long_unless(quick: bool, name: str, value: Any):
+    """A case of a test that `make test` passes over unless it is `quick`."""
+    return pytest.param(value, id=name, marks=() if quick else pytest.mark.long)
+
+
 FIRST = [pytest.param(True, marks=pytest.mark.long, id="first update"), pytest.param(False, id="later update")]
 
 
 @pytest.mark.parametrize("first", FIRST)
-@pytest.mark.parametrize("algorithm", ALGORITHMS.values(), ids=ALGORITHMS)
+@pytest.mark.parametrize("algorithm", [long_unless(name in PRESETS, name, x) for name, x in ALGORITHMS.items()])
 def test_gradient_of_every_algorithm_and_option(algorithm, first):
     config = GRPOConfig(prompts=2 * P, micro_prompts=P, group=G, length=T + 2, algorithm=algorithm)
     assert distance(config, first=first) <= NEAR
 
 
-@pytest.mark.parametrize("sampling", SAMPLING.values(), ids=SAMPLING)
+@pytest.mark.parametrize("sampling", [long_unless(len(x) > 1, name, x) for name, x in SAMPLING.items()])
 def test_gradient_under_every_way_to_sample(sampling):
     config = GRPOConfig(prompts=P, micro_prompts=P, group=G, length=T, algorithm=Paper(**LOUD), **sampling)
     assert distance(config, first=False) <= NEAR

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,13 +13,14 @@ from touchr1_jax.text.turns import ANY_TURN, LAST_TURN, TurnLanguage, compile_tu
 LANGUAGE = TurnLanguage(actions=("tac3d slide 5n", "xense press 2n", "xense slide 2n"))
 TOKENIZER = turn_tokenizer(LANGUAGE)
 TURNS = compile_turns(LANGUAGE, TOKENIZER)
+PLACES = jax.jit(TURNS.places)
 
 
 def read(text: str, *, last: bool = False) -> tuple[int, list[int]]:
     """Action and levels of one turn."""
     ids = TOKENIZER.encode(text)
     padded = np.array([ids + [TOKENIZER.pad_id] * (TURNS.length - len(ids))])
-    place = int(TURNS.places(jnp.asarray(padded), jnp.array([last]))[1][0])
+    place = int(PLACES(padded, np.array([last]))[1][0])
     return int(TURNS.action[place]), TURNS.answer[place].tolist()
 
 

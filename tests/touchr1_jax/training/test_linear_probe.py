@@ -38,6 +38,7 @@ def test_an_identity_leaks_nothing():
     assert (outside.argmax(-1) == labels).mean() < 0.5
 
 
+@pytest.mark.long
 def test_a_row_is_read_by_a_probe_that_never_saw_its_object(problem):
     """Other labels for an object's rows change what the others are told, and not what these rows are told."""
     features, labels, groups = problem

@@ -94,6 +94,7 @@ class TestSkipping:
     def test_nothing_is_counted_where_nobody_counts(self):
         assert count_skipped({"opt_state": optax.adam(0.1).init(PARAMS)}) is None
 
+    @pytest.mark.long
     def test_every_run_of_a_batch_skips_for_itself(self):
         optimizer = falling_adamw(0.1, 1.0, 4, max_grad_norm=1.0)
         grads = jnp.array([[1.0, 2.0], [jnp.nan, 2.0]])

@@ -133,6 +133,7 @@ def test_only_answer_tokens_count(params, batch):
     np.testing.assert_array_equal(loss(params, batch.replace(touch=batch.touch.replace(frames=frames))), before)
 
 
+@pytest.mark.long
 def test_rows_without_an_answer_add_nothing(params, batch):
     """A question that nobody annotated: the loss is the mean over the other three."""
     without = batch.replace(token_mask=batch.token_mask.at[1, 1].set(False))

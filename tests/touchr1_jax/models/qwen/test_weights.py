@@ -118,6 +118,7 @@ def test_tensors_are_cast(tmp_path, weights, stored, wanted):
     np.testing.assert_array_equal(loaded["decoder"]["norm"]["scale"], theirs)
 
 
+@pytest.mark.long
 def test_parameters_are_saved_as_published(tmp_path, weights, expected):
     save_params(tmp_path, expected, CONFIG)
     assert_equal(load_params(tmp_path, CONFIG, jnp.float32), expected)
@@ -126,6 +127,7 @@ def test_parameters_are_saved_as_published(tmp_path, weights, expected):
     assert len(sizes) == 1
 
 
+@pytest.mark.long
 def test_a_checkpoint_is_written_in_shards_one_tensor_at_a_time(tmp_path, weights, expected):
     seen, made = [], []
 
