@@ -163,6 +163,7 @@ def classes() -> Iterator[tuple[str, ast.ClassDef]]:
         yield from ((f"{module}.{n.name}", n) for n in ast.walk(tree) if isinstance(n, ast.ClassDef))
 
 
+@pytest.mark.long
 def test_dataclasses_are_frozen():
     """Those of Flax are; `dataclasses.dataclass` says so, or its class is listed with a reason."""
     made = {name: [ast.unparse(d) for d in node.decorator_list] for name, node in classes()}
@@ -170,6 +171,7 @@ def test_dataclasses_are_frozen():
     assert {name for name in plain if not any("frozen=True" in d for d in made[name])} == MUTABLE.keys()
 
 
+@pytest.mark.long
 def test_class_names_are_unique():
     """One name, one thing: a reader who searches for a class finds it alone."""
     where = collections.defaultdict(list)
@@ -251,6 +253,7 @@ def of_the_locale(tree: ast.AST) -> set[int]:
     return found
 
 
+@pytest.mark.long
 def test_texts_state_their_encoding():
     assert not {module: lines for module, tree in trees().items() if (lines := of_the_locale(tree))}
 

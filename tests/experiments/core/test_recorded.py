@@ -80,6 +80,7 @@ def test_a_finished_run_is_recorded_whole_but_for_paths_of_the_machine(root, tmp
         assert "results.json is" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_a_recorded_run_is_shown_as_its_report(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert run_command(["show", "conflict", "--runs-dir", str(tmp_path)], "experiments") == 0

@@ -182,6 +182,7 @@ def test_the_scale_chooses_the_defaults_that_overrides_change(arguments, scale, 
     assert (command.scale, command.config.steps) == (scale, steps)
 
 
+@pytest.mark.long
 def test_a_run_that_is_moved_while_it_goes_on_ends_and_is_whole_once_it_is_back(monkeypatch, capsys):
     train, aside = coin.train, Path("runs/coin/mine")
 

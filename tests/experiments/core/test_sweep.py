@@ -93,6 +93,7 @@ def test_a_folder_of_another_sweep_and_damaged_runs_are_named(workplace, capsys)
         assert "DamagedFileError" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_a_folder_may_have_a_name_that_is_not_utf_8(workplace):
     arguments = ("coin", "--vary", "toss.bias=0.1", "--steps", "1", "--seeds", "2", "--into", "n\udcff")
     assert sweep(arguments, package=FAKES) == 0

@@ -140,6 +140,7 @@ def test_loads_without_smoothness_know_nothing_of_each_other(noisy):
     np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
+@pytest.mark.long
 def test_magnification_is_undone(noisy):
     y, x = np.mgrid[:SIDE, :SIDE] - (SIDE - 1) / 2
     seen = noisy[..., :2] + noisy[..., 2:] / 25.0 * np.stack([x, y], -1)

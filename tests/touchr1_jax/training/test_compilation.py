@@ -51,6 +51,7 @@ def compiled(x: float) -> float:
     return float(jax.jit(lambda y: jnp.sin(y) * 3.25 + 1)(x))
 
 
+@pytest.mark.long
 def test_a_program_is_kept_and_found_again(keeping, tmp_path):
     """Not in the folder of earlier versions, where zstandard may have compressed an entry of the same key."""
     with compilations_kept(tmp_path, least_s=0.0):
