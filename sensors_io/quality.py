@@ -114,13 +114,13 @@ def time_gap(host_time_ns: np.ndarray, config: QualityConfig) -> np.ndarray:
     return late
 
 
-def judge(sequence: Sequence, config: QualityConfig | None = None) -> Mapping[Flag, np.ndarray]:
+def judge(sequence: Sequence) -> Mapping[Flag, np.ndarray]:
     """Every filter that a sequence has the arrays for: flag → frames that it marks, bool [N].
 
     Contact at the border, several contacts and lost markers need the pictures and a calibration: the extraction of the
     fields marks them.
     """
-    config = config or QualityConfig()
+    config = QualityConfig()
     found = {Flag.TIME_GAP: time_gap(sequence.host_time_ns, config)}
     if sequence.frames is not None:
         found[Flag.SATURATED] = saturated(sequence.frames, None, config)
@@ -147,14 +147,12 @@ def marked(flags: np.ndarray, found: Mapping[Flag, np.ndarray]) -> np.ndarray:
     return result
 
 
-def oddities(
-    sequence: Sequence, config: QualityConfig | None = None, rejected: Collection[Flag] = ()
-) -> tuple[str, ...]:
+def oddities(sequence: Sequence, rejected: Collection[Flag] = ()) -> tuple[str, ...]:
     """Why a legal sequence teaches nothing, or little, about touch; empty for an ordinary one.
 
     Pictures and fields are judged in the frames that are used, without those that are `rejected` for a flag.
     """
-    config, steps = config or QualityConfig(), np.diff(sequence.host_time_ns)
+    steps = np.diff(sequence.host_time_ns)
     found = {
         "times that run backwards": bool((steps < 0).any()),
         "times that stand still": len(steps) > 0 and not steps.any(),
@@ -173,7 +171,7 @@ def oddities(
         found[f"all pictures {colour}"] = even and not small
         found["no change between pictures"] = not even and _stands_still(shown.frames)
     if shown.depth_mm is not None:
-        found["no contact in any frame"] = bool(untouched(shown.depth_mm, shown.valid, config).all())
+        found["no contact in any frame"] = bool(untouched(shown.depth_mm, shown.valid, QualityConfig()).all())
     fields = [field for field in (shown.deformation_mm, shown.shear_mm, shown.depth_mm) if field is not None]
     unread = shown.valid is not None and not shown.valid.any()
     found["fields that are nowhere valid"] = unread
