@@ -114,6 +114,12 @@ def time_gap(host_time_ns: np.ndarray, config: QualityConfig) -> np.ndarray:
     return late
 
 
+def after_gap(sequence: Sequence, config: QualityConfig) -> np.ndarray:
+    """Frames before which time is missing, by their times or by the flag that they were recorded with."""
+    flagged: np.ndarray = (sequence.flags & Flag.TIME_GAP).astype(bool)
+    return flagged | time_gap(sequence.host_time_ns, config)
+
+
 def judge(sequence: Sequence) -> Mapping[Flag, np.ndarray]:
     """Every filter that a sequence has the arrays for: flag → frames that it marks, bool [N].
 
