@@ -68,8 +68,8 @@ def prepare_records(config: SourceConfig, context: Context) -> Path:
     about = [str(source), dataclasses.asdict(settings), *filter(None, [decoding])]
     identity = json.dumps(about, sort_keys=True)
     path = context.cache_dir / f"physiclear-{hashlib.sha256(identity.encode()).hexdigest()[:16]}"
-    make = lambda report: import_catalogue(list_physiclear(source, settings), path, progress=report)
-    _make(context, "importing videos", make)
+    importing = lambda report: import_catalogue(list_physiclear(source, settings), path, progress=report)
+    _make(context, "importing videos", importing)
     return path
 
 
