@@ -16,34 +16,29 @@ from sensors_io.schema import FRAME_ARRAYS, Flag, Sequence
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class QualityConfig:
-    """Limits of the filters.
+    """Limits of the filters of pictures.
 
     Args:
       saturated_level: grey level from which a channel counts as saturated.
       saturated_share: of the pixels, beyond what the gel at rest shows.
-      least_depth_mm: a frame whose field stays above it shows no contact.
-      unstable_n, unstable_window: change of the force between frames of one hold, and frames that it is judged over.
       gap_periods: time between frames, in median periods.
     """
 
     saturated_level: int = 254
     saturated_share: float = 0.002
-    least_depth_mm: float = 0.03
-    unstable_n: float = 0.5
-    unstable_window: int = 5
     gap_periods: float = 1.8
 
     def __post_init__(self) -> None:
         if not 0 < self.saturated_level <= 255:
             raise ValueError(f"saturated_level is {self.saturated_level}: must lie in 1..255; choose a grey level")
-        if self.unstable_window < 2:
-            raise ValueError(f"unstable_window is {self.unstable_window}: must be ≥ 2; judge two frames at least")
-        for name in ("saturated_share", "least_depth_mm", "unstable_n"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} is {getattr(self, name)}: must be > 0; raise it")
+        if not self.saturated_share > 0:
+            raise ValueError(f"saturated_share is {self.saturated_share}: must be > 0; raise it")
         if not self.gap_periods > 1:
             raise ValueError(f"gap_periods is {self.gap_periods}: must be > 1; a regular frame is one period apart")
 
+
+_LEAST_DEPTH_MM = 0.03  # a frame whose field stays below it shows no contact
+_UNSTABLE_N, _UNSTABLE_WINDOW = 0.5, 5  # change of the force in a hold, and frames that it is judged over
 
 HOLD = 2
 """The phase in which the force is meant to stand still, as in `FRAME_ARRAYS`."""
@@ -73,10 +68,10 @@ def _bright_share(picture: np.ndarray, level: int) -> float:
     return float((cv2.medianBlur(brightest, 3) >= level).mean())
 
 
-def untouched(depth_mm: np.ndarray, valid: np.ndarray | None, config: QualityConfig) -> np.ndarray:
+def untouched(depth_mm: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
     """Frames without contact, by their depth [N, h, w] where it may be read."""
     depth = depth_mm if valid is None else np.where(valid, depth_mm, 0)
-    found: np.ndarray = depth.max((1, 2)) < config.least_depth_mm
+    found: np.ndarray = depth.max((1, 2)) < _LEAST_DEPTH_MM
     return found
 
 
@@ -89,19 +84,18 @@ def incomplete(*columns: np.ndarray | None) -> np.ndarray:
     return found
 
 
-def unstable(force_n: np.ndarray, phase: np.ndarray, config: QualityConfig) -> np.ndarray:
-    """Frames of a hold about which the normal force changes by more than `unstable_n` within the window.
+def unstable(force_n: np.ndarray, phase: np.ndarray) -> np.ndarray:
+    """Frames of a hold about which the normal force changes by more than `_UNSTABLE_N` within the window.
 
     Args:
       force_n: float [N, 3].
       phase: uint8 [N].
-      config: limit and window.
     """
     normal = np.asarray(force_n[:, 2], np.float64)
-    before = config.unstable_window // 2
-    padded = np.pad(normal, (before, config.unstable_window - 1 - before), mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, config.unstable_window)
-    swing: np.ndarray = np.ptp(windows, axis=1) > config.unstable_n
+    before = _UNSTABLE_WINDOW // 2
+    padded = np.pad(normal, (before, _UNSTABLE_WINDOW - 1 - before), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, _UNSTABLE_WINDOW)
+    swing: np.ndarray = np.ptp(windows, axis=1) > _UNSTABLE_N
     return swing & (phase == HOLD)
 
 
@@ -114,20 +108,26 @@ def time_gap(host_time_ns: np.ndarray, config: QualityConfig) -> np.ndarray:
     return late
 
 
-def judge(sequence: Sequence, config: QualityConfig | None = None) -> Mapping[Flag, np.ndarray]:
+def after_gap(sequence: Sequence, config: QualityConfig) -> np.ndarray:
+    """Frames before which time is missing, by their times or by the flag that they were recorded with."""
+    flagged: np.ndarray = (sequence.flags & Flag.TIME_GAP).astype(bool)
+    return flagged | time_gap(sequence.host_time_ns, config)
+
+
+def judge(sequence: Sequence) -> Mapping[Flag, np.ndarray]:
     """Every filter that a sequence has the arrays for: flag → frames that it marks, bool [N].
 
     Contact at the border, several contacts and lost markers need the pictures and a calibration: the extraction of the
     fields marks them.
     """
-    config = config or QualityConfig()
+    config = QualityConfig()
     found = {Flag.TIME_GAP: time_gap(sequence.host_time_ns, config)}
     if sequence.frames is not None:
         found[Flag.SATURATED] = saturated(sequence.frames, None, config)
     if sequence.depth_mm is not None:
-        found[Flag.NO_CONTACT] = untouched(sequence.depth_mm, sequence.valid, config)
+        found[Flag.NO_CONTACT] = untouched(sequence.depth_mm, sequence.valid)
     if sequence.force_n is not None and (sequence.phase == HOLD).any():
-        found[Flag.UNSTABLE_FORCE] = unstable(sequence.force_n, sequence.phase, config)
+        found[Flag.UNSTABLE_FORCE] = unstable(sequence.force_n, sequence.phase)
     measured = [sequence.force_n, sequence.moment_nmm, sequence.target_force_n]
     if any(column is not None for column in measured):
         found[Flag.INCOMPLETE] = incomplete(*measured)
@@ -147,14 +147,12 @@ def marked(flags: np.ndarray, found: Mapping[Flag, np.ndarray]) -> np.ndarray:
     return result
 
 
-def oddities(
-    sequence: Sequence, config: QualityConfig | None = None, rejected: Collection[Flag] = ()
-) -> tuple[str, ...]:
+def oddities(sequence: Sequence, rejected: Collection[Flag] = ()) -> tuple[str, ...]:
     """Why a legal sequence teaches nothing, or little, about touch; empty for an ordinary one.
 
     Pictures and fields are judged in the frames that are used, without those that are `rejected` for a flag.
     """
-    config, steps = config or QualityConfig(), np.diff(sequence.host_time_ns)
+    steps = np.diff(sequence.host_time_ns)
     found = {
         "times that run backwards": bool((steps < 0).any()),
         "times that stand still": len(steps) > 0 and not steps.any(),
@@ -173,7 +171,7 @@ def oddities(
         found[f"all pictures {colour}"] = even and not small
         found["no change between pictures"] = not even and _stands_still(shown.frames)
     if shown.depth_mm is not None:
-        found["no contact in any frame"] = bool(untouched(shown.depth_mm, shown.valid, config).all())
+        found["no contact in any frame"] = bool(untouched(shown.depth_mm, shown.valid).all())
     fields = [field for field in (shown.deformation_mm, shown.shear_mm, shown.depth_mm) if field is not None]
     unread = shown.valid is not None and not shown.valid.any()
     found["fields that are nowhere valid"] = unread

@@ -34,20 +34,15 @@ def mean_of_means(x: Shaped[AnyArray, "*n G T"], mask: Bool[AnyArray, "*n G T"])
     return mean(mean(x, mask, -1), jnp.any(mask, -1), -1)
 
 
-def var(
-    x: Shaped[AnyArray, "*n"], mask: Bool[AnyArray, "*m"], axis: Axis = None, *, ddof: int = 0, keepdims: bool = False
-) -> Array:
-    """Variance of the selected elements, Σ m (x − mean)² / max(Σ m − ddof, 1); `ddof` 0 is the population's."""
-    size = count(x, mask, axis, keepdims=keepdims)
+def var(x: Shaped[AnyArray, "*n"], mask: Bool[AnyArray, "*m"], axis: Axis = None, *, keepdims: bool = False) -> Array:
+    """Population variance of the selected elements, Σ m (x − mean)² / max(Σ m, 1)."""
     centred = jnp.where(mask, x, 0) - mean(x, mask, axis, keepdims=True)
-    return total(centred**2, mask, axis, keepdims=keepdims) / jnp.maximum(size - ddof, 1)
+    return mean(centred**2, mask, axis, keepdims=keepdims)
 
 
-def std(
-    x: Shaped[AnyArray, "*n"], mask: Bool[AnyArray, "*m"], axis: Axis = None, *, ddof: int = 0, keepdims: bool = False
-) -> Array:
+def std(x: Shaped[AnyArray, "*n"], mask: Bool[AnyArray, "*m"], axis: Axis = None, *, keepdims: bool = False) -> Array:
     """Standard deviation of the selected elements, √var, with gradient 0 where the variance is 0."""
-    variance = var(x, mask, axis, ddof=ddof, keepdims=keepdims)
+    variance = var(x, mask, axis, keepdims=keepdims)
     varies = variance > 0
     return jnp.where(varies, jnp.sqrt(jnp.where(varies, variance, 1)), 0)
 

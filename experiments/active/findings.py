@@ -58,9 +58,7 @@ def findings(
             *tables,
             *plan_tables(seeds, estimates, learner),
             report.procedures_table(setup, chosen, test),
-            report.probe_table(
-                setup, test, "One contact, by probes", "Right answers of linear probes about test objects, %."
-            ),
+            report.probe_table(setup, test),
             stop_table(seeds, several),
             harm_table(world, learner, contacts, seeds, arms),
             price_table(seeds[0], arms),

@@ -53,7 +53,7 @@ def headroom_table(found: Mapping[tuple[str, int], Float[np.ndarray, "O A"]], so
     )
 
 
-def probe_table(contacts: ContactsConfig, beliefs: Beliefs, title: str, note: str) -> Table:
+def probe_table(contacts: ContactsConfig, beliefs: Beliefs) -> Table:
     """Accuracy of one contact by question and motion, each sensor's best force, in the order of the sensors."""
     right = np.stack([single(beliefs, a).mean(0) for a in beliefs.questions])  # A C
     by = right.reshape(len(PROPERTIES), len(contacts.sensors), len(contacts.motions), -1).max(-1)
@@ -62,7 +62,9 @@ def probe_table(contacts: ContactsConfig, beliefs: Beliefs, title: str, note: st
         | {m: " ".join(f"{100 * by[a, s, i]:.0f}" for s in range(by.shape[1])) for i, m in enumerate(contacts.motions)}
         for a, name in enumerate(PROPERTIES)
     ]
-    return named_table(title, rows, note=f"{note} Sensors in the order {', '.join(contacts.sensors)}; the best force.")
+    order = ", ".join(contacts.sensors)
+    note = f"Right answers of linear probes about test objects, %. Sensors in the order {order}; the best force."
+    return named_table("One contact, by probes", rows, note=note)
 
 
 def first_choices(contacts: ContactsConfig, played: Sequence[Played]) -> Float[np.ndarray, "A C"]:

@@ -227,9 +227,14 @@ def run_sweep(
 
 
 def launch_sweep(
-    launcher: Launcher, package: str, experiment: Experiment[Any], about: str, folder: Path, units: Sequence[SweepUnit],
+    launcher: Launcher,
+    package: str,
+    experiment: Experiment[Any],
+    about: str,
+    folder: Path,
+    units: Sequence[SweepUnit],
     wanted: Sequence[str],
-) -> int:  # fmt: skip
+) -> int:
     """As `run_sweep`, by workers of an engine."""
     scale = _list_units(experiment, about, folder, units)
     run = functools.partial(_run_unit, experiment.name, package)

@@ -27,7 +27,13 @@ from touchr1_jax.bench.items import KINDS, Ask, Touch
 from touchr1_jax.bench.metrics import BOTTOM, Scores
 from touchr1_jax.bench.questions.draw import Quota, draw
 from touchr1_jax.bench.scoring import REPORTED, ItemAnswers, score
-from touchr1_jax.bench.statistics import draw_clusters, drawn_means, improvement_interval, stratified_bootstrap_iqm
+from touchr1_jax.bench.statistics import (
+    TAILS,
+    draw_clusters,
+    drawn_means,
+    improvement_interval,
+    stratified_bootstrap_iqm,
+)
 from touchr1_jax.training.evaluation import Evaluation
 
 ORDINAL_LEVELS = 3  # K of ordinal levels: means of levels over K stay below one level
@@ -127,7 +133,7 @@ def bench_row(
 
 def average(tables: Sequence[Mapping[str, Scores]], objects: np.ndarray) -> Estimate:
     """`touch_average` of every seed, and its interval: one resample of the objects serves all metrics and seeds."""
-    cluster, weights = draw_clusters(objects, resamples=RESAMPLES, seed=0)
+    cluster, weights = draw_clusters(objects, resamples=RESAMPLES)
 
     def drawn(table: Mapping[str, Scores]) -> np.ndarray:
         means = {n: drawn_means(s.values, cluster[s.items], s.strata, weights) for n in AVERAGED for s in (table[n],)}
@@ -135,7 +141,7 @@ def average(tables: Sequence[Mapping[str, Scores]], objects: np.ndarray) -> Esti
         return np.array([touch_average({n: m[i] for n, m in means.items()}) for i in np.flatnonzero(whole)])
 
     each = tuple(touch_average({name: table[name].mean() for name in AVERAGED}) for table in tables)
-    low, high = np.quantile(np.mean([drawn(table) for table in tables], axis=0), (0.025, 0.975))
+    low, high = np.quantile(np.mean([drawn(table) for table in tables], axis=0), TAILS)
     return Estimate(mean=float(np.mean(each)), ci95=(float(low), float(high)), per_seed=each)
 
 

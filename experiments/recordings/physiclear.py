@@ -121,7 +121,7 @@ def predict(config: PhysiclearStudy, out: Path, context: Context) -> Results:
     """Answer for videos with a trained policy; several that are named one by one are also answered together."""
     if config.data_dir is None:
         own = cached_policy(config, context)
-        trained = load(config.policy or own, config.learn, of="" if config.policy else own.stem)
+        trained = load(config.policy, config.learn) if config.policy else load(own, config.learn, of=own.stem)
     else:
         trained = policy_of(config, config.data_dir, context)
     videos = describe_files(videos_of(config.predict), config.frames, context)
@@ -152,8 +152,7 @@ def policy_of(config: PhysiclearStudy, data_dir: Path, context: Context) -> Trai
         if all(np.array_equal(a, b) for a, b in pairs):
             return kept
         context.print(f"{path} was trained on other videos or scenes: another policy is trained")
-    train_policy(config, videos, auxiliary, context)
-    return load(context.directory / POLICY, config.learn)
+    return train_policy(config, videos, auxiliary, context)
 
 
 def in_words(log_prob: np.ndarray) -> dict[str, object]:
@@ -253,13 +252,16 @@ def training_time(timing: Mapping[str, float], seed: int) -> dict[str, float]:
     return {stage: s for stage, s in timing.items() if stage.startswith((*CACHED, "reading/", f"fold/{seed}/"))}
 
 
-def train_policy(config: PhysiclearStudy, videos: DescribedVideos, auxiliary: AuxiliaryData, context: Context) -> None:
-    """Train on all objects and keep the policy in the run and, for predictions, in the cache."""
+def train_policy(
+    config: PhysiclearStudy, videos: DescribedVideos, auxiliary: AuxiliaryData, context: Context
+) -> TrainedEnsemble:
+    """Train on all objects; the policy is kept in the run and, for predictions, in the cache."""
     trained = learn(config.learn, videos, auxiliary, config.seeds[0], context, "policy")
     save(context.directory / POLICY, trained)
     if config.objects is None:
         path = cached_policy(config, context)
         save(path, trained, of=path.stem)
+    return trained
 
 
 def cached_policy(config: PhysiclearStudy, context: Context) -> Path:

@@ -82,7 +82,7 @@ def cached(
             context.print(f"{stage}: made before, {path}")
             return found
         except DAMAGED as error:
-            context.print(f"{stage}: {path} is damaged ({error}), and is made again")
+            context.print(f"{stage}: {path} is damaged ({error.__cause__ or error}), and is made again")
     params = train()
     lines = np.frombuffer(json.dumps(_logged(context, stage)).encode(), np.uint8)
     context.processes.write_once(lambda: write_arrays(path, {_LINES: lines, **_flat(params)}, of=digest))

@@ -372,7 +372,7 @@ class SeedTraining(StudySeed):
                 if path.exists():
                     load_answers(path)
             except DAMAGED as error:
-                self.context.print(f"{path} is damaged ({error}), and is made again")
+                self.context.print(f"{path} is damaged ({error.__cause__ or error}), and is made again")
                 path.unlink()
             try:
                 if name in (SFT, CONTINUED, *self.arms) and (path.exists() or folder.exists()):

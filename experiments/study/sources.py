@@ -17,7 +17,8 @@ from experiments.core.context import Context
 from experiments.core.progress import ProgressCallback
 from experiments.study.dataset import Dataset, open_dataset, require_same_records
 from sensors_io.generate import generate_records
-from sensors_io.importers.physiclear import PhysiclearConfig, import_physiclear
+from sensors_io.importers.catalogue import import_catalogue
+from sensors_io.importers.physiclear import PhysiclearConfig, list_physiclear
 from sensors_io.locks import RecordsBusyError
 from sensors_io.pipeline import ClipConfig
 from sensors_io.quality import oddities, recorded_digest
@@ -67,7 +68,8 @@ def prepare_records(config: SourceConfig, context: Context) -> Path:
     about = [str(source), dataclasses.asdict(settings), *filter(None, [decoding])]
     identity = json.dumps(about, sort_keys=True)
     path = context.cache_dir / f"physiclear-{hashlib.sha256(identity.encode()).hexdigest()[:16]}"
-    _make(context, "importing videos", lambda report: import_physiclear(source, path, config=settings, progress=report))
+    importing = lambda report: import_catalogue(list_physiclear(source, settings), path, progress=report)
+    _make(context, "importing videos", importing)
     return path
 
 

@@ -207,9 +207,12 @@ def _work(
 
 
 def train_part(
-    config: StudyConfig, arms: Mapping[str, Weights], algorithms: Mapping[str, AnyAlgorithm], part: StudyPart,
+    config: StudyConfig,
+    arms: Mapping[str, Weights],
+    algorithms: Mapping[str, AnyAlgorithm],
+    part: StudyPart,
     context: Context,
-) -> None:  # fmt: skip
+) -> None:
     """Train one policy of one seed into the cache, where `run_study` finds it; other arguments as there."""
     data, policy, tactile = _opened(config, context)
     arms = {name: weights for name, weights in arms.items() if name == part.name}
@@ -225,9 +228,14 @@ def _opened(config: StudyConfig, context: Context, at_once: int = 1) -> tuple[Da
 
 
 def _shared(
-    config: TrainingConfig, data: Dataset, policy: TouchPolicy, arms: Mapping[str, Weights],
-    algorithms: Mapping[str, AnyAlgorithm], probed: ProbeFeatures, context: Context,
-) -> dict[str, Any]:  # fmt: skip
+    config: TrainingConfig,
+    data: Dataset,
+    policy: TouchPolicy,
+    arms: Mapping[str, Weights],
+    algorithms: Mapping[str, AnyAlgorithm],
+    probed: ProbeFeatures,
+    context: Context,
+) -> dict[str, Any]:
     """Fields of all seeds."""
     of = lambda arm: algorithms.get(arm, config.grpo.algorithm)
     return {

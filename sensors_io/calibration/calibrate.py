@@ -7,7 +7,7 @@ import numpy as np
 
 from sensors_io.calibration.circles import Circles, find_circles
 from sensors_io.calibration.coverage import coverage
-from sensors_io.calibration.fit import ColourMapSettings, prepare, solve_map
+from sensors_io.calibration.fit import prepare, solve_map
 from sensors_io.calibration.presses import BallPresses, Touches
 from sensors_io.calibration.validate import BallErrors, cross_validate
 from sensors_io.fields.contact import ContactConfig, steepest_change
@@ -73,7 +73,7 @@ class UnusedPress:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CalibrationReport:
-    """Origin of a calibration: presses used and left out, their contacts, chosen settings, errors on unseen presses.
+    """Origin of a calibration: presses used and left out, their contacts, λ of the prior, errors on unseen presses.
 
     `warnings` say why the map may not transfer to other objects or places, and what to do.
     """
@@ -82,7 +82,7 @@ class CalibrationReport:
     left_out: tuple[UnusedPress, ...]
     touches: Touches
     misfit: np.ndarray
-    choice: ColourMapSettings
+    ridge: float
     errors: BallErrors
     warnings: tuple[str, ...] = ()
 
@@ -121,7 +121,7 @@ def calibrate(
     _check_size(kept, circles.touches, config)
     config = dataclasses.replace(config, folds=min(config.folds, len(kept)))
     equations = prepare(kept, circles.touches, seed=config.seed, folds=config.folds)
-    colours, choice = solve_map(equations.grams, seed=config.seed, folds=config.folds)
+    colours, ridge = solve_map(equations.grams, seed=config.seed, folds=config.folds)
     progress(1, fits := 1 + config.folds * config.repeats)
     errors = cross_validate(
         kept,
@@ -138,7 +138,7 @@ def calibrate(
         left_out=tuple(UnusedPress(name=names[i], reason=reason) for i, reason in sorted(bad.items())),
         touches=Touches.of(equations.touches.stacked()[equations.given]),
         misfit=circles.misfit,
-        choice=choice,
+        ridge=ridge,
         errors=errors,
         warnings=_warnings(errors, equations.touches, kept.shape, config),
     )

@@ -116,24 +116,14 @@ class PressEquations:
     given: np.ndarray
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ColourMapSettings:
-    """Strength of the prior, and the held-out rms error of the normal that it was chosen by: mean and range."""
-
-    ridge: float
-    error: float
-    error_range: tuple[float, float]
-
-
-def fit_map(presses: BallPresses, touches: Touches, *, seed: int = 0, folds: int = 5) -> ColourMap:
+def fit_map(presses: BallPresses, touches: Touches, *, seed: int = 0) -> ColourMap:
     """Fit the map, move each centre to where the map sees it, fit again; the order of the presses changes no bit.
 
     Args:
       presses, touches: where each press is.
-      seed: of the folds.
-      folds: of the cross-validation that chooses the prior.
+      seed: of the folds of the cross-validation that chooses the prior.
     """
-    return solve_map(prepare(presses, touches, seed=seed, folds=folds).grams, seed=seed, folds=folds)[0]
+    return solve_map(prepare(presses, touches, seed=seed).grams, seed=seed)[0]
 
 
 def prepare(presses: BallPresses, touches: Touches, *, seed: int = 0, folds: int = 5) -> PressEquations:
@@ -146,10 +136,8 @@ def prepare(presses: BallPresses, touches: Touches, *, seed: int = 0, folds: int
     return PressEquations(presses=presses, touches=touches, grams=grams, given=np.argsort(order))
 
 
-def solve_map(
-    grams: list[Gram], *, seed: int = 0, folds: int = 5, repeats: int = REPEATS
-) -> tuple[ColourMap, ColourMapSettings]:
-    """The map with the prior whose held-out error over all folds of all repeats is least on average."""
+def solve_map(grams: list[Gram], *, seed: int = 0, folds: int = 5, repeats: int = REPEATS) -> tuple[ColourMap, float]:
+    """The map and the λ of its prior, whose held-out error over all folds of all repeats is least on average."""
     total, errors = Gram.total(grams), []
     rng = np.random.default_rng(seed)
     for _ in range(repeats):
@@ -158,16 +146,11 @@ def solve_map(
             out = Gram.total([grams[i] for i in order[k::folds]])
             rest = total.without(out)
             errors.append([out.error(weights) for weights in rest.solutions(RIDGES)])
-    mean = np.mean(errors, 0)
-    best = int(mean.argmin())
-    by_repeat = np.reshape([row[best] for row in errors], (repeats, -1)).mean(1)
-    chosen = ColourMapSettings(
-        ridge=RIDGES[best], error=float(mean[best]), error_range=(float(by_repeat.min()), float(by_repeat.max()))
-    )
+    ridge = RIDGES[int(np.mean(errors, 0).argmin())]
     shape = (len(position_terms(POSITION_DEGREE)), len(colour_terms(DEGREE)), 2)
-    (weights,) = total.solutions((chosen.ridge,))
+    (weights,) = total.solutions((ridge,))
     weights = weights.reshape(shape).astype(np.float32)
-    return ColourMap(weights=weights, degree=DEGREE, position_degree=POSITION_DEGREE), chosen
+    return ColourMap(weights=weights, degree=DEGREE, position_degree=POSITION_DEGREE), ridge
 
 
 def recentre(presses: BallPresses, touches: Touches, colours: ColourMap) -> Touches:

@@ -101,7 +101,7 @@ def report_table(made: Calibration, report: CalibrationReport) -> Table:
     table.add_row("sensing window, mm (measure it)", f"{columns_mm:.1f} × {rows_mm:.1f}")
     contact_mm = float(np.median(report.touches.radius_px)) * made.mm_per_px
     table.add_row("radius of the contacts, mm (median)", f"{contact_mm:.2f}")
-    table.add_row("strength of the smoothness prior", f"{report.choice.ridge:.0e}")
+    table.add_row("strength of the smoothness prior", f"{report.ridge:.0e}")
     for name, value in report.errors.figures().items():
         table.add_row(f"held out: {name}", f"{value:.3g}")
     for warning in report.warnings:

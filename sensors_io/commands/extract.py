@@ -111,7 +111,7 @@ class Extract:
         rest = read_picture(self.background)
         straight = self._straightening(calibration, (rest.shape[0], rest.shape[1]))
         extractor = Extractor(straight(rest), straight.mm_per_px, calibration, self.config)
-        pictures = read_pictures(self.inputs, self.sensor)
+        pictures = read_pictures(self.inputs, self.sensor, self.config.quality)
         if pictures.frames.shape[1:] != rest.shape:
             sizes = f"{pictures.frames.shape[1:3]} and {rest.shape[:2]}"
             raise SourceError(f"pictures and background have sizes {sizes}: must be equal; crop them alike")

@@ -6,7 +6,6 @@ a sample is taken right after the grab, before anything is decoded or resized.
 
 import dataclasses
 from collections.abc import Mapping
-from types import TracebackType
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -85,9 +84,7 @@ class Device(Protocol):
         """
         ...
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         """Close it, also one that was lost."""
         ...
 

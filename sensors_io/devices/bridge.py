@@ -22,7 +22,6 @@ import selectors
 import subprocess
 import time
 from collections.abc import Mapping
-from types import TracebackType
 from typing import IO, Any, Self
 
 import cv2
@@ -228,9 +227,7 @@ class Bridge:
             raise DeviceNotFoundError(f"{c.sensor} {c.serial or '(any)'} gave no frame: {error}") from error
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         self._close()
 
     def read(self, timeout_s: float) -> Sample:

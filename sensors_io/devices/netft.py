@@ -18,7 +18,6 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Mapping
-from types import TracebackType
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -222,9 +221,7 @@ class NetFt:
             ) from error
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         if self._socket is not None:
             with contextlib.suppress(OSError):  # a sensor that is gone streams no more
                 self._command(Command.STOP)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import threading
-from types import TracebackType
 from typing import Self
 
 from sensors_io.clock import NS_PER_S, Clock, MonotonicClock
@@ -177,9 +176,7 @@ class Reader:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         self._stop.set()
         if self._thread is not None:
             self._thread.join()

@@ -6,7 +6,6 @@ What was injected is counted in `Replay.truth`, so that a reader's books can be 
 import dataclasses
 import pathlib
 from collections.abc import Iterator
-from types import TracebackType
 from typing import Self
 
 import numpy as np
@@ -138,9 +137,7 @@ class Replay:
             self._skip_until(now_ns)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         pass
 
     def read(self, timeout_s: float) -> Sample:

@@ -1,7 +1,6 @@
 """The RGB-D camera that looks at the object: colour and depth paired by time, and where the contact is in its view."""
 
 import dataclasses
-from types import TracebackType
 from typing import Self
 
 import numpy as np
@@ -111,13 +110,11 @@ class Rgbd:
         self._last_depth = None
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         try:
-            self._depth.__exit__(kind, error, trace)
+            self._depth.__exit__(*exc)
         finally:
-            self._colour.__exit__(kind, error, trace)
+            self._colour.__exit__(*exc)
 
     def read(self, timeout_s: float) -> Sample:
         """The next pair, see `Device.read`; colour without depth in time, and the other way round, is passed over."""

@@ -4,7 +4,6 @@ import dataclasses
 import socket
 import time
 import warnings
-from types import TracebackType
 from typing import Self
 
 from sensors_io.clock import NS_PER_S
@@ -88,9 +87,7 @@ class Tac3dSensor:
             ) from silence
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         self._close()
 
     def read(self, timeout_s: float) -> Sample:

@@ -15,7 +15,7 @@ from sensors_io.fields.inversion import InverseConfig
 from sensors_io.fields.shear import ShearReader
 from sensors_io.fields.types import Calibration, CalibrationError, Fields
 from sensors_io.layer import Layer
-from sensors_io.quality import QualityConfig, saturated, time_gap
+from sensors_io.quality import QualityConfig, saturated
 from sensors_io.schema import Flag, SchemaError, Spec, check_arrays
 
 
@@ -139,26 +139,11 @@ class Extractor:
             **{name: array[None].astype(np.float32) for name, array in found.items()},
         )
 
-    def extract(self, frames: np.ndarray, host_time_ns: np.ndarray | None = None) -> Fields:
-        """Fields of N pictures.
-
-        Args:
-          frames: uint8 [N, H, W, 3] RGB, in the order of time.
-          host_time_ns: int64 [N], from which gaps are told; `None` for stills, of which none follows another.
-
-        Raises:
-          ValueError: no picture, or another number of times.
-        """
+    def extract(self, frames: np.ndarray) -> Fields:
+        """Fields of N stills uint8 [N, H, W, 3] RGB, of which none follows another; `ValueError` if there is none."""
         if frames.ndim != 4 or not len(frames):
             raise ValueError(f"frames have shape {list(frames.shape)}: must be [N, H, W, 3] with N ≥ 1; stack them")
-        if host_time_ns is None:
-            return joined([self.read(frame, apart=True) for frame in frames])
-        if len(host_time_ns) != len(frames):
-            raise ValueError(
-                f"host_time_ns has {len(host_time_ns)} times: must have {len(frames)}, one a frame; cut it"
-            )
-        late = time_gap(host_time_ns, self.config.quality).tolist()
-        return joined([self.read(frame, gap=gap) for frame, gap in zip(frames, late, strict=True)])
+        return joined([self.read(frame, apart=True) for frame in frames])
 
     def _contacts(self, picture: np.ndarray) -> ContactRegions:
         """Contacts by colour, where no depth tells them."""

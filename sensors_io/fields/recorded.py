@@ -12,7 +12,7 @@ from sensors_io.fields.extract import ExtractConfig, Extractor, joined
 from sensors_io.fields.sources import SourceError, read_picture
 from sensors_io.fields.types import Calibration, CalibrationError, Fields
 from sensors_io.importers.keep import at_height
-from sensors_io.quality import QualityConfig, time_gap
+from sensors_io.quality import after_gap
 from sensors_io.remote import Place, local
 from sensors_io.schema import Flag, SchemaError, Sequence
 
@@ -140,8 +140,7 @@ def _named() -> Iterator[None]:
 def recorded_fields(sequence: Sequence, extractor: Extractor) -> Fields:
     """Fields of every frame of a sequence with pictures, by the extractor that `RecordedGels` has for it."""
     assert sequence.frames is not None
-    late = time_gap(sequence.host_time_ns, QualityConfig()) | (sequence.flags & Flag.TIME_GAP).astype(bool)
-    frames = zip(sequence.frames, late.tolist(), strict=True)
+    frames = zip(sequence.frames, after_gap(sequence, extractor.config.quality).tolist(), strict=True)
     return joined([extractor.read(f, gap=gap, apart=n == 0) for n, (f, gap) in enumerate(frames)])
 
 

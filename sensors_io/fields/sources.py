@@ -12,9 +12,8 @@ from sensors_io.importers.keep import Keep
 from sensors_io.importers.video import VideoError, read_video
 from sensors_io.importers.videos import SUFFIXES
 from sensors_io.index import looks_like_records
-from sensors_io.quality import QualityConfig, time_gap
+from sensors_io.quality import QualityConfig, after_gap
 from sensors_io.records import RecordStore
-from sensors_io.schema import Flag
 
 PICTURES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"})
 VIDEOS = frozenset(SUFFIXES)
@@ -71,17 +70,18 @@ def read_picture(path: pathlib.Path) -> np.ndarray:
         raise SourceError(f"{path} {error}: must be a whole picture; replace it") from error
 
 
-def read_pictures(inputs: Sequence[pathlib.Path], sensor: str) -> PictureSequence:
+def read_pictures(inputs: Sequence[pathlib.Path], sensor: str, quality: QualityConfig | None = None) -> PictureSequence:
     """All pictures of files, folders, videos and records, in the order given; files of a folder by name.
 
     Args:
       inputs: paths.
       sensor: whose frames are taken out of records.
+      quality: tells what is a gap between frames of records.
 
     Raises:
       SourceError: a path without pictures, or pictures of different sizes.
     """
-    shots = [shot for path in inputs for shot in _read(path, sensor)]
+    shots = [shot for path in inputs for shot in _read(path, sensor, quality or QualityConfig())]
     if not shots:
         raise SourceError("inputs are empty: at least one path is needed; name a picture, folder, video or records")
     shapes = {shot.frame.shape: shot.name for shot in reversed(shots)}
@@ -96,9 +96,9 @@ def read_pictures(inputs: Sequence[pathlib.Path], sensor: str) -> PictureSequenc
     )
 
 
-def _read(path: pathlib.Path, sensor: str) -> Iterator[_Shot]:
+def _read(path: pathlib.Path, sensor: str, quality: QualityConfig) -> Iterator[_Shot]:
     if looks_like_records(path):
-        yield from _records(path, sensor)
+        yield from _records(path, sensor, quality)
     elif path.is_dir():
         files = pictures.below(path, PICTURES)
         if not files:
@@ -120,7 +120,7 @@ def _read(path: pathlib.Path, sensor: str) -> Iterator[_Shot]:
         yield _Shot(name=path.name, frame=read_picture(path), apart=True)
 
 
-def _records(path: pathlib.Path, sensor: str) -> Iterator[_Shot]:
+def _records(path: pathlib.Path, sensor: str, quality: QualityConfig) -> Iterator[_Shot]:
     """Camera frames of one sensor, contact by contact; gaps by their flags and their times."""
     store, found = RecordStore(path, allow_incomplete=True), False
     for i in range(len(store)):
@@ -128,8 +128,8 @@ def _records(path: pathlib.Path, sensor: str) -> Iterator[_Shot]:
             sequence = store.contact(i, fields=False)[sensor]
             if sequence.frames is not None:
                 found = True
-                late = time_gap(sequence.host_time_ns, QualityConfig()) | (sequence.flags & Flag.TIME_GAP).astype(bool)
-                for n, (frame, gap) in enumerate(zip(sequence.frames, late.tolist(), strict=True)):
+                gaps = after_gap(sequence, quality).tolist()
+                for n, (frame, gap) in enumerate(zip(sequence.frames, gaps, strict=True)):
                     yield _Shot(name=f"{sequence.name}#{n}", frame=frame, gap=gap, apart=n == 0)
     if not found:
         raise SourceError(f"{path} holds no camera frames of {sensor}: name another sensor or other records")

@@ -13,13 +13,13 @@ import functools
 import json
 import pathlib
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from sensors_io.errors import MALFORMED, told
-from sensors_io.importers.catalogue import Catalogue, ImportReport, Listed, Taken, fingerprint, import_catalogue
+from sensors_io.importers.catalogue import Catalogue, Listed, Taken, fingerprint
 from sensors_io.importers.holdout import hold_out
 from sensors_io.importers.keep import ImportSourceError, Keep, Skip, check_share
 from sensors_io.importers.pictures import film, nominal_ns
@@ -57,28 +57,6 @@ class LabelledObject:
 
     card: ObjectCard
     videos: tuple[str, ...]
-
-
-def import_physiclear(
-    source: pathlib.Path,
-    out: pathlib.Path,
-    *,
-    config: PhysiclearConfig | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> ImportReport:
-    """Write the recordings in `source` as records in `out`, as `import_catalogue` does.
-
-    Args:
-      source: directory with labels.json and videos/.
-      out: directory of the records.
-      config: what to keep; None is `PhysiclearConfig()`.
-      progress: called with the number of videos done and their total.
-
-    Raises:
-      ImportSourceError: no labels.json or no videos there, labels that contradict themselves, or no readable video.
-      RecordsExistError: `out` holds other records.
-    """
-    return import_catalogue(list_physiclear(source, config or PhysiclearConfig()), out, progress=progress)
 
 
 def list_physiclear(source: pathlib.Path, config: PhysiclearConfig) -> Catalogue:

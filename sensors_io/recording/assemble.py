@@ -35,13 +35,11 @@ class Assembled:
       sequences: one of each sensor that gave a frame, in the order of the session.
       backgrounds: the gel at rest before the contact, or else after it, uint8 [H, W, 3] by sensor.
       complete: whether the contact was.
-      torn_bytes: of an entry that was cut off.
     """
 
     sequences: tuple[Sequence, ...]
     backgrounds: Mapping[str, np.ndarray]
     complete: bool
-    torn_bytes: int
 
 
 def assemble(path: pathlib.Path) -> Assembled | None:
@@ -50,7 +48,7 @@ def assemble(path: pathlib.Path) -> Assembled | None:
     Raises:
       JournalError: a damaged journal, one that does not begin with a contact, or one of an earlier version.
     """
-    entries, torn = read_journal(path)
+    entries = read_journal(path)
     if not entries:
         return None  # killed before or in its very first entry
     if entries[0].kind != "start":
@@ -59,7 +57,7 @@ def assemble(path: pathlib.Path) -> Assembled | None:
     if "streams" not in start:
         raise JournalError(f"{path} was written by an earlier version: bring it in with that one, or move it away")
     try:
-        return _assembled(start, entries, torn)
+        return _assembled(start, entries)
     except UserError:
         raise
     except MALFORMED as error:
@@ -69,7 +67,7 @@ def assemble(path: pathlib.Path) -> Assembled | None:
         ) from error
 
 
-def _assembled(start: Mapping[str, Any], entries: Seq[JournalEntry], torn: int) -> Assembled | None:
+def _assembled(start: Mapping[str, Any], entries: Seq[JournalEntry]) -> Assembled | None:
     streams = range(len(start["streams"]))
     for e in entries:  # one that nothing reads would be gone with its journal
         if e.kind not in _KINDS or (e.kind == "frame" and e.plain["stream"] not in streams):
@@ -94,7 +92,6 @@ def _assembled(start: Mapping[str, Any], entries: Seq[JournalEntry], torn: int) 
         sequences=tuple(shared.sequence(i, own) for i, own in enumerate(frames) if own),
         backgrounds=backgrounds,
         complete=bool(end and end["complete"]),
-        torn_bytes=torn,
     )
 
 

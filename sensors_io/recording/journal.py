@@ -18,7 +18,6 @@ import struct
 import time
 import zlib
 from collections.abc import Iterator, Mapping
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -100,9 +99,7 @@ class JournalWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         self.close()
 
     def _write(self, parts: list[bytes]) -> None:
@@ -114,8 +111,8 @@ class JournalWriter:
                 rest = rest[os.write(self._file, rest) :]
 
 
-def read_journal(path: pathlib.Path) -> tuple[list[JournalEntry], int]:
-    """All whole entries, and the number of bytes of a last one that was cut off.
+def read_journal(path: pathlib.Path) -> list[JournalEntry]:
+    """All whole entries, without a last one that was cut off.
 
     Raises:
       JournalError: an entry that is damaged though others follow it, or no file.
@@ -130,12 +127,10 @@ def read_journal(path: pathlib.Path) -> tuple[list[JournalEntry], int]:
             data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if size else b""
         except OSError:  # a file system without maps
             data = path.read_bytes()
-    whole = list(_entries(path, memoryview(data)))
-    end = whole[-1][1] if whole else 0
-    return [entry for entry, _ in whole], size - end
+    return list(_entries(path, memoryview(data)))
 
 
-def _entries(path: pathlib.Path, data: memoryview) -> Iterator[tuple[JournalEntry, int]]:
+def _entries(path: pathlib.Path, data: memoryview) -> Iterator[JournalEntry]:
     start = 0
     while start + _PREFIX.size <= len(data):
         magic, size, checksum = _PREFIX.unpack_from(data, start)
@@ -154,7 +149,7 @@ def _entries(path: pathlib.Path, data: memoryview) -> Iterator[tuple[JournalEntr
                 f"{path} holds an entry of another layout at byte {start} ({error!r}): move it away, or bring it in "
                 "with the version that wrote it"
             ) from error
-        yield entry, end
+        yield entry
         start = end
 
 

@@ -18,7 +18,6 @@ import sys
 import threading
 import urllib.parse
 from collections.abc import Mapping
-from types import TracebackType
 from typing import Any, ClassVar, Self
 
 import cv2
@@ -152,9 +151,7 @@ class LiveView:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         with self._changed:
             self._ended = True
             self._changed.notify_all()

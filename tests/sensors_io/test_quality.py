@@ -31,8 +31,8 @@ def test_force_that_swings_in_a_hold_is_unstable_elsewhere_not() -> None:
     force = np.zeros((12, 3))
     force[6:, 2] = -2.0
     hold, load = np.full(12, 2, np.uint8), np.full(12, 1, np.uint8)
-    assert np.flatnonzero(quality.unstable(force, hold, CONFIG)).tolist() == [4, 5, 6, 7]
-    assert not quality.unstable(force, load, CONFIG).any()
+    assert np.flatnonzero(quality.unstable(force, hold)).tolist() == [4, 5, 6, 7]
+    assert not quality.unstable(force, load).any()
 
 
 def test_a_gap_marks_the_frame_after_it() -> None:
@@ -44,8 +44,8 @@ def test_a_gap_marks_the_frame_after_it() -> None:
 def test_untouched_frames_are_judged_where_depth_is_valid() -> None:
     depth, valid = np.zeros((2, 3, 3), np.float32), np.ones((2, 3, 3), bool)
     depth[:, 1, 1], valid[1, 1, 1] = 0.5, False
-    assert quality.untouched(depth, valid, CONFIG).tolist() == [False, True]
-    assert not quality.untouched(depth, None, CONFIG).any()
+    assert quality.untouched(depth, valid).tolist() == [False, True]
+    assert not quality.untouched(depth, None).any()
 
 
 def test_odd_but_legal_sequences_are_named() -> None:

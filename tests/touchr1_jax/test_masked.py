@@ -38,12 +38,6 @@ def test_hand_values(name, everything, rows):
     np.testing.assert_allclose(STATISTICS[name](X, MASK, axis=1), rows, rtol=1e-6)
 
 
-def test_sample_variance():
-    assert masked.var(X, MASK, ddof=1) == pytest.approx(26 / 6)
-    np.testing.assert_allclose(masked.var(X, MASK, 1, ddof=1), [0.5, 0])
-    np.testing.assert_allclose(masked.std(X, MASK, 1, ddof=1), [np.sqrt(0.5), 0])
-
-
 @pytest.mark.parametrize("name", STATISTICS)
 @hypothesis.settings(max_examples=25, deadline=None)
 @hypothesis.given(

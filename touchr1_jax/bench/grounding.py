@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from touchr1_jax.bench.metrics import BOTTOM, Scores, accuracy, check_same_shape
-from touchr1_jax.bench.statistics import Interval, draw_clusters, drawn_means
+from touchr1_jax.bench.statistics import TAILS, Interval, draw_clusters, drawn_means
 
 CONTROLS = ("drop", "shuffle", "noise", "swapped")
 """Replacements of the touch."""
@@ -53,8 +53,6 @@ def least_tactile_use(
     objects: np.ndarray,
     *,
     resamples: int = 10_000,
-    seed: int = 0,
-    level: float = 0.95,
 ) -> LeastGain:
     """The headline, min_c TUG_c over drop, noise and swapped, and shuffle on order-dependent questions only.
 
@@ -77,9 +75,9 @@ def least_tactile_use(
     gains[SHUFFLE] = _only(gains[SHUFFLE], ordered)
     if not len(gains[SHUFFLE].values):
         del gains[SHUFFLE]
-    cluster, weights = draw_clusters(objects, resamples=resamples, seed=seed)
+    cluster, weights = draw_clusters(objects, resamples=resamples)
     drawn = np.stack([drawn_means(g.values, cluster[g.items], g.strata, weights) for g in gains.values()])
-    low, high = np.nanquantile(np.fmin.reduce(drawn), ((1 - level) / 2, (1 + level) / 2))
+    low, high = np.nanquantile(np.fmin.reduce(drawn), TAILS)
     least = min(gains, key=lambda name: gains[name].mean())
     return LeastGain(control=least, gain=Interval(mean=gains[least].mean(), low=float(low), high=float(high)))
 

@@ -12,6 +12,9 @@ from typing import Literal
 import numpy as np
 from scipy import special
 
+TAILS = (0.025, 0.975)
+"""Quantiles that every interval spans: it covers 95 %."""
+
 EXACT_LIMIT = 16
 """Up to this many differences the sign-flip test enumerates all 2^n sign patterns."""
 
@@ -36,14 +39,12 @@ def clustered_bootstrap(
     *,
     strata: np.ndarray | None = None,
     resamples: int = 10_000,
-    seed: int = 0,
-    level: float = 0.95,
 ) -> Interval:
     """Percentile interval of a mean when values of one object are not independent: whole objects are resampled.
 
     With C clusters, draw w ~ Multinomial(C, 1/C) and take θ* = mean_s (Σ_c w_c Σ_cs) / (Σ_c w_c n_cs), where Σ_cs and
     n_cs are the sum and the number of the values of cluster c in stratum s; a stratum that a resample misses is left
-    out of that resample's mean.  The interval spans the (1 ∓ level)/2 quantiles of θ*.  The difference of two policies
+    out of that resample's mean.  The interval spans the .025 and .975 quantiles of θ*.  The difference of two policies
     on the same answers is `clustered_bootstrap(a - b, ...)`.
 
     Args:
@@ -58,24 +59,13 @@ def clustered_bootstrap(
     """
     strata = np.zeros(len(values), int) if strata is None else strata
     _check_values(values, clusters, strata)
-    cluster_ids, cluster = np.unique(clusters, return_inverse=True)
-    stratum_ids, stratum = np.unique(strata, return_inverse=True)
-    if len(cluster_ids) < 2:
-        raise ValueError(f"clusters holds {len(cluster_ids)}: an interval over objects needs two; score more objects")
-    sums = np.zeros((len(cluster_ids), len(stratum_ids)))
-    counts = np.zeros_like(sums)
-    np.add.at(sums, (cluster, stratum), values)
-    np.add.at(counts, (cluster, stratum), 1.0)
-    weights = np.random.default_rng(seed).multinomial(
-        len(cluster_ids), np.full(len(cluster_ids), 1 / len(cluster_ids)), size=resamples
-    )
-    seen = weights @ counts
-    means = np.where(seen > 0, weights @ sums / np.maximum(seen, 1), np.nan)
-    low, high = np.quantile(np.nanmean(means, axis=1), _tails(level))
-    return Interval(mean=float(np.mean(sums.sum(0) / counts.sum(0))), low=float(low), high=float(high))
+    cluster, weights = draw_clusters(clusters, resamples=resamples)
+    low, high = np.quantile(drawn_means(values, cluster, strata, weights), TAILS)
+    mean = np.mean([values[strata == s].mean() for s in np.unique(strata)])
+    return Interval(mean=float(mean), low=float(low), high=float(high))
 
 
-def draw_clusters(objects: np.ndarray, *, resamples: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def draw_clusters(objects: np.ndarray, *, resamples: int) -> tuple[np.ndarray, np.ndarray]:
     """Resamples of whole objects that several metrics share, so that a function of them has an interval.
 
     Args:
@@ -89,7 +79,7 @@ def draw_clusters(objects: np.ndarray, *, resamples: int, seed: int) -> tuple[np
     """
     cluster = numbered(objects)
     number = int(cluster.max()) + 1
-    return cluster, np.random.default_rng(seed).multinomial(number, np.full(number, 1 / number), size=resamples)
+    return cluster, np.random.default_rng(0).multinomial(number, np.full(number, 1 / number), size=resamples)
 
 
 def numbered(objects: np.ndarray) -> np.ndarray:
@@ -128,8 +118,8 @@ def drawn_means(values: np.ndarray, cluster: np.ndarray, strata: np.ndarray, wei
     return np.where(known > 0, np.nansum(table, axis=0) / np.maximum(known, 1), np.nan)
 
 
-def student_interval(values: np.ndarray, *, level: float = 0.95) -> Interval:
-    """x̄ ± t_{n−1, (1+level)/2} · s/√n over n independent training runs; give paired differences to compare two arms.
+def student_interval(values: np.ndarray) -> Interval:
+    """x̄ ± t_{n−1, .975} · s/√n over n independent training runs; give paired differences to compare two arms.
 
     Args:
       values: float [n], finite, n ≥ 2.  At n = 5 the factor is 2.776.
@@ -140,7 +130,7 @@ def student_interval(values: np.ndarray, *, level: float = 0.95) -> Interval:
     if n < 2:
         raise ValueError(f"values holds {n}: an interval over seeds needs two at least; train more seeds")
     _check_finite(values=values)
-    half = float(special.stdtrit(n - 1, (1 + level) / 2)) * float(np.std(values, ddof=1)) / math.sqrt(n)
+    half = float(special.stdtrit(n - 1, TAILS[1])) * float(np.std(values, ddof=1)) / math.sqrt(n)
     mean = float(np.mean(values))
     return Interval(mean=mean, low=mean - half, high=mean + half)
 
@@ -159,9 +149,7 @@ def interquartile_mean(scores: np.ndarray) -> float:
     return float(ordered[cut : ordered.size - cut].mean())
 
 
-def stratified_bootstrap_iqm(
-    scores: np.ndarray, *, resamples: int = 2_000, seed: int = 0, level: float = 0.95
-) -> Interval:
+def stratified_bootstrap_iqm(scores: np.ndarray, *, resamples: int = 2_000) -> Interval:
     """Percentile interval of the IQM when the runs of each task are resampled on their own.
 
     Args:
@@ -174,10 +162,10 @@ def stratified_bootstrap_iqm(
     """
     middle, (runs, tasks) = interquartile_mean(scores), scores.shape
     _check_runs(scores=scores)
-    pick = np.random.default_rng(seed).integers(runs, size=(resamples, runs, tasks))
+    pick = np.random.default_rng(0).integers(runs, size=(resamples, runs, tasks))
     ordered = np.sort(scores[pick, np.arange(tasks)].reshape(resamples, -1), axis=1)
     cut = ordered.shape[1] // 4
-    low, high = np.quantile(ordered[:, cut : ordered.shape[1] - cut].mean(axis=1), _tails(level))
+    low, high = np.quantile(ordered[:, cut : ordered.shape[1] - cut].mean(axis=1), TAILS)
     return Interval(mean=middle, low=float(low), high=float(high))
 
 
@@ -196,9 +184,7 @@ def probability_of_improvement(better: np.ndarray, than: np.ndarray) -> float:
     return float(np.mean((x > y) + 0.5 * (x == y)))
 
 
-def improvement_interval(
-    better: np.ndarray, than: np.ndarray, *, resamples: int = 2_000, seed: int = 0, level: float = 0.95
-) -> Interval:
+def improvement_interval(better: np.ndarray, than: np.ndarray, *, resamples: int = 2_000) -> Interval:
     """Percentile interval of the probability of improvement when the runs of each task are resampled on either side.
 
     Args:
@@ -211,18 +197,18 @@ def improvement_interval(
     """
     point = probability_of_improvement(better, than)
     _check_runs(better=better, than=than)
-    rng, tasks = np.random.default_rng(seed), np.arange(better.shape[1])
+    rng, tasks = np.random.default_rng(0), np.arange(better.shape[1])
     x, y = (a[rng.integers(0, len(a), (resamples, *a.shape)), tasks] for a in (better, than))
     x, y = x[:, :, None], y[:, None]
-    low, high = np.quantile(((x > y) + 0.5 * (x == y)).mean(axis=(1, 2, 3)), _tails(level))
+    low, high = np.quantile(((x > y) + 0.5 * (x == y)).mean(axis=(1, 2, 3)), TAILS)
     return Interval(mean=point, low=float(low), high=float(high))
 
 
-def sign_flip_test(differences: np.ndarray, *, resamples: int = 20_000, seed: int = 0) -> float:
+def sign_flip_test(differences: np.ndarray) -> float:
     """Two-sided p-value of "the paired differences are symmetric about 0".
 
     p = share of sign patterns ε ∈ {−1, 1}^n with |mean(ε·d)| ≥ |mean(d)|, all 2^n of them up to n = 16, else a random
-    sample with (1 + hits)/(1 + resamples).  It cannot fall below 2^{1−n}: five seeds reach .0625 at best.
+    sample of 20,000 with (1 + hits)/20,001.  It cannot fall below 2^{1−n}: five seeds reach .0625 at best.
 
     Args:
       differences: float [n].
@@ -235,10 +221,10 @@ def sign_flip_test(differences: np.ndarray, *, resamples: int = 20_000, seed: in
     if exact:
         signs = np.array(list(itertools.product((1.0, -1.0), repeat=n)))
     else:
-        signs = np.random.default_rng(seed).choice((1.0, -1.0), size=(resamples, n))
+        signs = np.random.default_rng(0).choice((1.0, -1.0), size=(20_000, n))
     observed = abs(differences.sum())
     hits = int(np.sum(np.abs(signs @ differences) >= observed - 1e-12 * (1 + observed)))
-    return hits / len(signs) if exact else (1 + hits) / (1 + resamples)
+    return hits / len(signs) if exact else (1 + hits) / (1 + len(signs))
 
 
 def crossed_test(differences: np.ndarray, clusters: np.ndarray, *, strata: np.ndarray | None = None) -> float:
@@ -294,7 +280,7 @@ def holm(p_values: np.ndarray) -> np.ndarray:
     return adjusted
 
 
-def wilson_interval(passed: int, of: int, *, level: float = 0.95) -> Interval:
+def wilson_interval(passed: int, of: int) -> Interval:
     """A share and its score interval, (p̂ + z²/2n ± z √(p̂(1 − p̂)/n + z²/4n²)) / (1 + z²/n); never empty at 0 or 1.
 
     Args:
@@ -308,7 +294,7 @@ def wilson_interval(passed: int, of: int, *, level: float = 0.95) -> Interval:
     """
     if not 0 <= passed <= of or of < 1:
         raise ValueError(f"passed is {passed} of {of}: must lie in 0..n with n ≥ 1; count again")
-    z, p = float(special.ndtri((1 + level) / 2)), passed / of
+    z, p = float(special.ndtri(TAILS[1])), passed / of
     middle = (p + z * z / (2 * of)) / (1 + z * z / of)
     half = z * math.sqrt(p * (1 - p) / of + z * z / (4 * of * of)) / (1 + z * z / of)
     return Interval(mean=p, low=middle - half, high=middle + half)
@@ -346,10 +332,6 @@ def cohens_kappa(a: np.ndarray, b: np.ndarray, levels: int, *, weights: Literal[
     return 1 - float((weight * table).sum()) / expected
 
 
-def _tails(level: float) -> tuple[float, float]:
-    return (1 - level) / 2, (1 + level) / 2
-
-
 def _check_values(values: np.ndarray, clusters: np.ndarray, strata: np.ndarray) -> None:
     if not len(values) == len(clusters) == len(strata):
         lengths = f"{len(values)}, {len(clusters)} and {len(strata)}"
@@ -375,7 +357,7 @@ def _check_finite(**arrays: np.ndarray) -> None:
             raise ValueError(f"{name}[{first}] is {values.flat[first]}: must be finite; leave undefined ones out")
 
 
-def skill(error: np.ndarray, reference: np.ndarray, objects: np.ndarray, resamples: int = 2000) -> Interval:
+def skill(error: np.ndarray, reference: np.ndarray, objects: np.ndarray) -> Interval:
     """1 − Σ error / Σ reference over n contacts, with an interval over objects.
 
     Args:
@@ -389,10 +371,10 @@ def skill(error: np.ndarray, reference: np.ndarray, objects: np.ndarray, resampl
     _check_finite(error=error, reference=reference)
     if not reference.sum() > 0:
         raise ValueError(f"reference sums to {reference.sum()}: must be > 0, or no skill is defined; choose another")
-    group, weights = draw_clusters(objects, resamples=resamples, seed=0)
+    group, weights = draw_clusters(objects, resamples=2_000)
     sums = np.zeros((weights.shape[1], 2))
     np.add.at(sums, group, np.stack([error, reference], 1).astype(float))
     drawn = weights @ sums
     drawn = drawn[drawn[:, 1] > 0]
-    low, high = np.quantile(1 - drawn[:, 0] / drawn[:, 1], (0.025, 0.975))
+    low, high = np.quantile(1 - drawn[:, 0] / drawn[:, 1], TAILS)
     return Interval(mean=float(1 - error.sum() / reference.sum()), low=float(low), high=float(high))

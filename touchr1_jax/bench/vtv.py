@@ -20,7 +20,7 @@ from jaxtyping import Float, Int
 
 from touchr1_jax.bench.averages import VTV, vtv_average
 from touchr1_jax.bench.metrics import Scores
-from touchr1_jax.bench.statistics import Interval, draw_clusters, drawn_means
+from touchr1_jax.bench.statistics import TAILS, Interval, draw_clusters, drawn_means
 
 ATTRIBUTES = ("hardness", "protrusion", "elasticity", "friction")
 LEVELS = 3
@@ -185,12 +185,12 @@ def _matched(log_probs: np.ndarray, tasks: VTVTasks) -> np.ndarray:
 
 def averaged(scores: Mapping[str, Scores], objects: np.ndarray) -> dict[str, Interval]:
     """Means of every task and of "average", with 95 % intervals from the same resamples of whole objects [n]."""
-    cluster, weights = draw_clusters(objects, resamples=RESAMPLES, seed=0)
+    cluster, weights = draw_clusters(objects, resamples=RESAMPLES)
     drawn = {name: drawn_means(s.values, cluster[s.items], s.strata, weights) for name, s in scores.items()}
     means = {name: s.mean() for name, s in scores.items()}
     drawn["average"] = np.mean([drawn[name] for name in VTV], axis=0)
     means["average"] = vtv_average(means)
-    spans = {name: np.nanquantile(values, (0.025, 0.975)) for name, values in drawn.items()}
+    spans = {name: np.nanquantile(values, TAILS) for name, values in drawn.items()}
     return {name: Interval(mean=means[name], low=float(low), high=float(high)) for name, (low, high) in spans.items()}
 
 

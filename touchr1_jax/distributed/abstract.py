@@ -27,6 +27,8 @@ from touchr1_jax.rl.rollout import GRPOBatch
 from touchr1_jax.rl.scoring import ScoreFn
 from touchr1_jax.types import Params, Target
 
+ATTRIBUTES, NOISE_DRAWS = 4, 64  # of a question's target; of the bank of noise
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PromptShape:
@@ -72,8 +74,6 @@ def abstract_grpo(
     *,
     lora: LoraConfig | None = None,
     four_bits: bool = False,
-    attributes: int = 4,
-    draws: int = 64,
 ) -> AbstractStep:
     """The decoder of a Qwen-VL policy on encoded prompts.
 
@@ -84,8 +84,6 @@ def abstract_grpo(
       optimizer: whose state is counted.
       lora: adapters to train on a decoder that is frozen in bfloat16; `None` trains the decoder.
       four_bits: the kernels of the frozen decoder's layers are in four bits (`models.nf4`).
-      attributes: of a question's target.
-      draws: size of the bank of noise.
     """
     s, n, nv = prompt.streams, prompt.stream_tokens, prompt.view_tokens
     p, d, v = shape.grpo.drawn, config.decoder.hidden_size, config.decoder.vocab_size
@@ -98,7 +96,7 @@ def abstract_grpo(
         view=of((p, nv, (1 + config.vision.levels) * d), kind),
         view_mask=of((p,), bool),
     )
-    flags, numbers = of((p, attributes), bool), of((p, attributes), jnp.int32)
+    flags, numbers = of((p, ATTRIBUTES), bool), of((p, ATTRIBUTES), jnp.int32)
     target = Target(asked=flags, label=numbers, levels=numbers, ordinal=flags, streams=of((p, s), bool))
     length = prompt.tokens
     batch = GRPOBatch(features=features, ids=of((p, length), jnp.int32), mask=of((p, length), bool), target=target)
@@ -121,7 +119,9 @@ def abstract_grpo(
         fns = dataclasses.replace(fns, lora=lora)
     state = jax.eval_shape(lambda p, k: start_state(p, optimizer, k, shape.grpo), params, key)
     reference = jax.eval_shape(lambda p: at_precision(shape.grpo, p), params)
-    return AbstractStep(fns, state, batch, FrozenInputs(reference=reference, noise=of((draws, s, n, d), kind)), base)
+    return AbstractStep(
+        fns, state, batch, FrozenInputs(reference=reference, noise=of((NOISE_DRAWS, s, n, d), kind)), base
+    )
 
 
 def compile_grpo(

@@ -3,17 +3,10 @@
 The rules and bounds work as those of `alarms`, on the metrics of `active.exploration_metrics`.
 """
 
-from touchr1_jax.rl.alarms import RULES, AlarmRule, Metrics, of_candidates
-from touchr1_jax.rl.alarms import untouched_share as untouched_prompts
+from touchr1_jax.rl.alarms import RULES, AlarmRule, Metrics, of_candidates, untouched_share
 
 SHARED = ("F3", "F7", "F8", "F9", "F10", "F15", "F16")
 """Codes of the rules of `alarms` that hold for trajectories too."""
-
-
-def untouched_share(now: Metrics, start: Metrics) -> float | None:
-    """Share of trajectories without an action."""
-    del start
-    return now["no_action_share"]
 
 
 def single_share(now: Metrics, start: Metrics) -> float | None:
@@ -35,20 +28,14 @@ def question_of_first_kind(now: Metrics, start: Metrics) -> float | None:
     return now["first_kind_information"] if differ and now["first_kind_peak"] >= 0.5 else None
 
 
-def silent_actions(now: Metrics, start: Metrics) -> float | None:
-    """Share of the actions that observe nothing."""
-    del start
-    return now["silent_share"]
-
-
 ACTIVE_RULES: tuple[AlarmRule, ...] = (
-    *(rule for rule in RULES if rule.code in SHARED and rule.check is not untouched_prompts),  # A1 counts these
+    *(rule for rule in RULES if rule.code in SHARED and rule.check is not untouched_share),  # A1 counts these
     AlarmRule(
         code="A1",
         meaning="the policy never touches: lower the prices, or start from a policy that touches at random",
         bound=0.95,
         reason="one group of eight trajectories in three then has no touch at all to compare with",
-        check=untouched_share,
+        check=lambda now, start: now["no_action_share"],
     ),
     AlarmRule(
         code="A2",
@@ -79,6 +66,6 @@ ACTIVE_RULES: tuple[AlarmRule, ...] = (
         meaning="most touches observe nothing: leave the choices out that are not available",
         bound=0.5,
         reason="half of the price is then paid for nothing",
-        check=silent_actions,
+        check=lambda now, start: now["silent_share"],
     ),
 )

@@ -1,6 +1,6 @@
-"""Alarms: known failures of reinforcement from touch, each detected in the metrics of a run by one small function.
+"""Alarms: known failures of reinforcement from touch, each detected in the metrics of a run by one small `check`.
 
-A function gets the mean metrics of the last `WINDOW` steps and of the first `START` steps (the initial policy), and
+It gets the mean metrics of the last `WINDOW` steps and of the first `START` steps (the initial policy), and
 returns the number that is compared with a bound, or `None`.
 The codes F1 … F16 number the failures; F11, the collapse of latent prediction, and F14, the prior of the labels, belong
 to other stages.
@@ -91,12 +91,6 @@ def echo_excess(now: Metrics, start: Metrics) -> float | None:
     return of_candidates(now, "echo_share") - of_candidates(now, "echo_right")
 
 
-def grounding_size(now: Metrics, start: Metrics) -> float | None:
-    """F3: mean grounding of a token, nat."""
-    del start
-    return now.get("grounding")
-
-
 def swap_blindness(now: Metrics, start: Metrics) -> float | None:
     """F4: accuracy lost under noise, less that lost under another object's touch; needs the controls of R_tu."""
     del start
@@ -154,11 +148,6 @@ def entropy_collapse(now: Metrics, start: Metrics) -> float | None:
     return now["entropy"] / max(start["entropy"], 1e-6) if stuck and known else None
 
 
-def entropy_growth(now: Metrics, start: Metrics) -> float | None:
-    """F9: entropy above the initial one, nat."""
-    return now["entropy"] - start["entropy"]
-
-
 def forgotten_stream(now: Metrics, start: Metrics) -> float | None:
     """F10: the smallest grounding of a stream that was perturbed, nat."""
     del start
@@ -186,36 +175,6 @@ def left_out_groups(now: Metrics, start: Metrics) -> float | None:
     return max((now[name] for name in ("drawn_nonfinite_share", "nonfinite_share") if name in now), default=None)
 
 
-def left_out_updates(now: Metrics, start: Metrics) -> float | None:
-    """F15: share of the last `WINDOW` steps with an update that was left out, because it was not finite."""
-    del start
-    return now[LEFT_OUT]
-
-
-def learned_rollouts(now: Metrics, start: Metrics) -> float | None:
-    """F15: share of the rollouts that are learned from, neither masked as cut off nor dropped by `mismatch_limit`."""
-    del start
-    return now.get("learned_share")
-
-
-def frozen_time(now: Metrics, start: Metrics) -> float | None:
-    """F12: share of streams whose steps all have one time id."""
-    del start
-    return now["static_time_share"]
-
-
-def gamed_answers(now: Metrics, start: Metrics) -> float | None:
-    """F13: share of answers that name levels and cannot be read."""
-    del start
-    return of_candidates(now, "gamed_share")
-
-
-def sampler_mismatch(now: Metrics, start: Metrics) -> float | None:
-    """F16: mean |log π_learner − log π_sampler| of a token, nat; of a sampler that lags, its lag is part of it."""
-    del start
-    return now.get("sampler_gap")
-
-
 RULES: tuple[AlarmRule, ...] = (
     AlarmRule(
         code="F1",
@@ -236,7 +195,7 @@ RULES: tuple[AlarmRule, ...] = (
         meaning="grounding grows without bound",
         bound=1.0,
         reason="1 nat a token over a whole answer: every word is e times likelier with touch than with noise",
-        check=grounding_size,
+        check=lambda now, start: now.get("grounding"),  # mean of a token, nat
     ),
     AlarmRule(
         code="F4",
@@ -286,7 +245,7 @@ RULES: tuple[AlarmRule, ...] = (
         meaning="entropy grows without bound",
         bound=0.2,
         reason="on every token of an answer of 15: three nats, so twenty times as many answers in play as at first",
-        check=entropy_growth,
+        check=lambda now, start: now["entropy"] - start["entropy"],  # nat
     ),
     AlarmRule(
         code="F10",
@@ -318,14 +277,14 @@ RULES: tuple[AlarmRule, ...] = (
         meaning="all frames have the same time index, so that shuffled frames test nothing",
         bound=0.01,
         reason="recorded frames have different indices; only a cast or a unit error makes them equal",
-        check=frozen_time,
+        check=lambda now, start: now["static_time_share"],  # of the streams
     ),
     AlarmRule(
         code="F13",
         meaning="answers name levels but cannot be parsed",
         bound=0.2,
         reason="a supervised policy writes one such answer in twenty; four times as many are a strategy",
-        check=gamed_answers,
+        check=lambda now, start: of_candidates(now, "gamed_share"),
     ),
     AlarmRule(
         code="F15",
@@ -339,7 +298,7 @@ RULES: tuple[AlarmRule, ...] = (
         meaning="updates are skipped, because their gradient or the policy after them is not finite",
         bound=0.1,
         reason="one step in ten loses an update; a single one may be a rare overflow",
-        check=left_out_updates,
+        check=lambda now, start: now[LEFT_OUT],
         at_once=True,
     ),
     AlarmRule(
@@ -347,7 +306,7 @@ RULES: tuple[AlarmRule, ...] = (
         meaning="fewer than half of the rollouts are learned from: the others are cut off, or too far from the sampler",
         bound=0.5,
         reason="the policy gradient then shows a minority of the rollouts that the rewards compare",
-        check=learned_rollouts,
+        check=lambda now, start: now.get("learned_share"),
         below=True,
         at_once=True,
     ),
@@ -356,7 +315,7 @@ RULES: tuple[AlarmRule, ...] = (
         meaning="the sampler is not the learner's policy: their log-probabilities differ",
         bound=0.1,
         reason="ten times what bfloat16 rounds a token off; beyond it weights, positions or a temperature differ",
-        check=sampler_mismatch,
+        check=lambda now, start: now.get("sampler_gap"),  # mean of a token, nat; a lag of the sampler is part of it
         at_once=True,
     ),
 )

@@ -114,15 +114,11 @@ class TouchBank:
         return state, outcome
 
 
-def check_bank(bank: TouchBank, *, least: int = 2) -> None:
+def check_bank(bank: TouchBank) -> None:
     """Refuse a bank with objects or choices that leave nothing to choose.
 
-    Args:
-      bank: contacts.
-      least: fewest contacts of an object; 1 accepts objects with a single one.
-
     Raises:
-      EnvironmentCheckError: no object, a choice that no object has, or an object with fewer contacts.
+      EnvironmentCheckError: no object, a choice that no object has, or an object with fewer than two contacts.
     """
     available = np.asarray(bank.available)
     if not available.shape[0]:
@@ -130,10 +126,10 @@ def check_bank(bank: TouchBank, *, least: int = 2) -> None:
     missing = [words for i, words in enumerate(bank.actions) if not available[:, i].any()]
     if missing:
         raise EnvironmentCheckError(f"choices {missing} are available for no object; leave them out of the bank")
-    few = np.flatnonzero(available.sum(1) < least)
+    few = np.flatnonzero(available.sum(1) < 2)
     if len(few):
         raise EnvironmentCheckError(
-            f"{len(few)} objects, the first of them {few[:5].tolist()}, have fewer than {least} contacts: there is "
+            f"{len(few)} objects, the first of them {few[:5].tolist()}, have fewer than 2 contacts: there is "
             "nothing to choose; leave them out of the bank"
         )
 

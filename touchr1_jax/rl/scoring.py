@@ -67,7 +67,6 @@ def make_score(
     Raises (when traced):
       RewardError: a reward that gives NaN or infinity for some answer; it names the reward and the answer.
     """
-
     return WeightedScore(parser, rewards, weights, decode)
 
 

@@ -164,8 +164,7 @@ def fit(
 
     Step t is dispatched, then batch t + 1 is made, then the metrics of step t − 1 are fetched: all this happens while
     the device computes, so that the device does not wait, and after a save the next batch is ready.  Resuming restores
-    state
-    and data iterator together: the result equals the uninterrupted run's bit for bit.
+    state and data iterator together: the result equals the uninterrupted run's bit for bit.
 
     Args:
       step: (state, batch) → (state, metrics).

@@ -85,7 +85,7 @@ def test_other_scenes_lie_elsewhere(monkeypatch, context):
 
 @pytest.mark.parametrize(
     ("maker", "change"),
-    [("generate_records", {}), ("import_physiclear", {"data": "physiclear", "data_dir": Path("videos")})],
+    [("generate_records", {}), ("import_catalogue", {"data": "physiclear", "data_dir": Path("videos")})],
 )
 def test_records_that_another_run_is_making_are_waited_for(monkeypatch, context, console, maker, change):
     busy = [RecordsBusyError("records are being written"), RecordsBusyError("records are being written")]
@@ -94,6 +94,7 @@ def test_records_that_another_run_is_making_are_waited_for(monkeypatch, context,
         if busy:
             raise busy.pop()
 
+    monkeypatch.setattr(sources, "list_physiclear", lambda source, config: None)
     monkeypatch.setattr(sources, maker, make)
     monkeypatch.setattr(sources.time, "sleep", lambda seconds: None)
     prepare_records(dataclasses.replace(GENERATED, **change), context)
@@ -102,11 +103,9 @@ def test_records_that_another_run_is_making_are_waited_for(monkeypatch, context,
 
 def test_imported_videos_are_named_by_folder_and_settings(tmp_path, context, monkeypatch):
     imported = []
-    monkeypatch.setattr(
-        sources,
-        "import_physiclear",
-        lambda source, out, *, config, progress: progress(1, 2) or imported.append((out, config)),
-    )
+    monkeypatch.setattr(sources, "list_physiclear", lambda source, config: config)
+    taken = lambda listed, out, *, progress: progress(1, 2) or imported.append((out, listed))
+    monkeypatch.setattr(sources, "import_catalogue", taken)
     first = dataclasses.replace(GENERATED, data="physiclear", data_dir=tmp_path / "a")
     other = dataclasses.replace(first, physiclear=PhysiclearConfig(height=60))
     elsewhere = dataclasses.replace(first, data_dir=tmp_path / "b")

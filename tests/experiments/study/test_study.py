@@ -135,6 +135,11 @@ def test_an_unfinished_run_makes_a_damaged_policy_again(policy, params, data, tm
     SeedTraining._drop_damaged(seed, [SFT])
     assert not printed
     assert answers.exists()
+    save_answers(answers_path(context, SFT, 1), answers_about(TEST))
+    shutil.move(answers_path(context, SFT, 1), answers)
+    SeedTraining._drop_damaged(seed, [SFT])
+    assert printed.pop().count(str(answers)) == 1
+    save_answers(answers, answers_about(TEST))
     if file:
         (folder / file).write_bytes((folder / file).read_bytes()[:-9])
     else:

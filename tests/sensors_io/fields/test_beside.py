@@ -15,7 +15,9 @@ from sensors_io.fields import beside
 from sensors_io.fields.beside import FieldsJob, fields_beside
 from sensors_io.fields.extract import ExtractConfig, Extractor
 from sensors_io.fields.recorded import RecordedGels, RestGel, recorded_fields
+from sensors_io.fields.sources import read_pictures
 from sensors_io.fields.types import CalibrationError
+from sensors_io.quality import QualityConfig
 from sensors_io.records import RecordsExistError, RecordStore, RecordWriter
 from sensors_io.schema import Flag
 from tests.sensors_io import fakes
@@ -59,6 +61,20 @@ def test_a_frame_is_followed_from_the_one_before_it_in_its_recording():
     for _ in range(2):
         moved = recorded_fields(recorded(frames=frames), extractor).deformation_mm
         np.testing.assert_allclose(np.median(moved[..., 0], (1, 2)), [0.8, 0.8, 1.4], atol=0.02)
+
+
+@pytest.mark.parametrize(("periods", "late"), [(1.8, [False, False, True]), (2.5, [False, False, False])])
+def test_gaps_are_of_the_periods_that_the_config_says(tmp_path, periods, late):
+    config = ExtractConfig(quality=QualityConfig(gap_periods=periods))
+    times = np.cumsum([0, 40, 40, 80], dtype=np.int64) * 1_000_000
+    frames = np.stack([bare()] * 4)
+    made = fakes.sequence(0, length=4, **BARE | {"mm_per_px": 0.1, "frames": frames, "host_time_ns": times})
+    found = recorded_fields(made, Extractor(bare(), 0.1, config=config)).flags & np.uint32(Flag.TIME_GAP)
+    assert found.astype(bool).tolist() == [False, *late]
+    with RecordWriter(tmp_path, meta=fakes.META) as writer:
+        writer.write_object(fakes.card(0))
+        writer.write_contact([made])
+    assert read_pictures([tmp_path], made.sensor, config.quality).gap.tolist() == [False, *late]
 
 
 def test_fields_lie_beside_the_pictures(tmp_path):

@@ -140,14 +140,10 @@ def test_a_calibration_is_read_back_and_a_changed_one_is_refused(tmp_path: pathl
 
 def test_a_gap_is_flagged_and_a_still_is_not() -> None:
     extractor = Extractor(dotted(), 0.1)
-    far, frames = dotted(11.0), np.stack([dotted()] * 5)
+    far = dotted(11.0)
     found = [extractor.read(dotted()), extractor.read(far, gap=True), extractor.read(far, apart=True)]
     assert [bool(f.flags[0] & Flag.TIME_GAP) for f in found] == [False, True, False]
-    timed = extractor.extract(frames, np.array([0, 40, 80, 240, 280], np.int64)).flags
-    assert [bool(f & Flag.TIME_GAP) for f in timed.tolist()] == [False, False, False, True, False]
-    assert not (extractor.extract(frames).flags & np.uint32(Flag.TIME_GAP)).any()  # stills carry no time
-    with pytest.raises(ValueError, match="host_time_ns has 2 times: must have 5"):
-        extractor.extract(frames, np.array([0, 1], np.int64))
+    assert not (extractor.extract(np.stack([dotted()] * 5)).flags & np.uint32(Flag.TIME_GAP)).any()
 
 
 def test_pictures_are_read_by_number_and_sizes_must_agree(tmp_path: pathlib.Path) -> None:

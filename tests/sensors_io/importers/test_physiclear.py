@@ -6,8 +6,9 @@ import pathlib
 import numpy as np
 import pytest
 
+from sensors_io.importers.catalogue import import_catalogue
 from sensors_io.importers.keep import ImportSourceError
-from sensors_io.importers.physiclear import PhysiclearConfig, import_physiclear, read_labels
+from sensors_io.importers.physiclear import PhysiclearConfig, list_physiclear, read_labels
 from sensors_io.records import RecordsExistError, RecordStore
 from sensors_io.schema import ATTRIBUTES, MATERIALS, UNKNOWN
 from tests.sensors_io.checks import refused
@@ -21,7 +22,7 @@ def test_videos_become_records(tmp_path):
     cup = entry("cup", split="val", material="glass", videos=["cup_7.avi"])
     source = folder(tmp_path / "in", entry("ball"), cup, entry("fig", split="unlabelled", **unknown))
     seen = []
-    report = import_physiclear(source, tmp_path / "out", config=KEEP, progress=lambda *now: seen.append(now))
+    report = import_catalogue(list_physiclear(source, KEEP), tmp_path / "out", progress=lambda *now: seen.append(now))
     assert report.contacts == 5
     assert report.skipped == report.unlabelled == ()
     assert dict(report.objects) == {"train": 1, "val": 1, "test": 0, "unlabelled": 1}
@@ -50,7 +51,7 @@ def test_what_cannot_be_read_is_skipped_and_listed(tmp_path):
     (videos / "ball_2.avi").unlink()
     (videos / "jar_0.avi").write_bytes(b"")
     film(videos / "stray_0.avi")
-    report = import_physiclear(source, tmp_path / "out", config=KEEP)
+    report = import_catalogue(list_physiclear(source, KEEP), tmp_path / "out")
     assert report.contacts == 3
     files = {f"{name}.avi" for name in ("ball_0", "ball_2", "jar_0", "cover_0", "stray_0")}
     assert {skip.name for skip in report.skipped} == {*files, "jar", "lid"}
@@ -64,7 +65,7 @@ def test_what_cannot_be_read_is_skipped_and_listed(tmp_path):
 
 
 def run(source):
-    return import_physiclear(source, source.parent / "out", config=KEEP)
+    return import_catalogue(list_physiclear(source, KEEP), source.parent / "out")
 
 
 BALL = entry("ball")
@@ -105,7 +106,7 @@ def test_labels_of_another_encoding_are_named_and_not_quoted(tmp_path):
 @pytest.mark.skipif("TOUCHR1_PHYSICLEAR" not in os.environ, reason="TOUCHR1_PHYSICLEAR does not name the recordings")
 def test_the_real_recordings(tmp_path):
     source = pathlib.Path(os.environ["TOUCHR1_PHYSICLEAR"])
-    report = import_physiclear(source, tmp_path / "out", config=PhysiclearConfig(height=60, max_frames=8))
+    report = import_catalogue(list_physiclear(source, PhysiclearConfig(height=60, max_frames=8)), tmp_path / "out")
     assert report.contacts == 437
     assert report.skipped == report.unlabelled == ()
     store = RecordStore(tmp_path / "out")

@@ -105,8 +105,7 @@ def test_banks_without_a_choice_are_refused(available):
         check_bank(make_bank(available=available))
 
 
-def test_objects_with_one_contact_may_be_accepted():
-    check_bank(make_bank(), least=1)
+def test_objects_with_one_contact_are_refused():
     with pytest.raises(EnvironmentCheckError, match=r"\[1\]"):
         check_bank(make_bank())
 
