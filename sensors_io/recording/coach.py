@@ -5,6 +5,7 @@ tap loads and unloads three times; a hold waits at its force.  The coach sees on
 a prompt, the phase that is under way, and whether to record.
 """
 
+import collections
 import dataclasses
 
 import numpy as np
@@ -20,6 +21,7 @@ _MOVING = {
 }
 
 
+_GLITCH_NS = 10_000_000  # within which the median of the readings counts: one wrong reading is no press and no release
 _REST_S = 1.0  # of free motion, whose first pictures are taken for the gel at rest
 
 
@@ -103,7 +105,7 @@ class Coach:
         self._stage = stage
         self._config = config or CoachConfig()
         self._clear_since_ns: int | None = None
-        self._newest_ns = -(1 << 63)
+        self._latest: collections.deque[tuple[int, float]] = collections.deque()
         self._armed = False
         self._phase = Phase.APPROACH
         self._since_ns = 0
@@ -118,8 +120,12 @@ class Coach:
 
     def step(self, time_ns: int, force_n: np.ndarray) -> Advice:
         """Take one force [3] on the gel into account; one that is not finite, or that a later one overtook, is none."""
-        if np.isfinite(force_n).all() and time_ns >= self._newest_ns:
-            self._normal, self._newest_ns = -float(force_n[2]), time_ns
+        latest = self._latest
+        if np.isfinite(force_n).all() and (not latest or time_ns >= latest[-1][0]):
+            latest.append((time_ns, -float(force_n[2])))
+            while time_ns - latest[0][0] > _GLITCH_NS:
+                latest.popleft()
+            self._normal = sorted(normal for _, normal in latest)[len(latest) // 2]
             if not self._armed:
                 self._arm(time_ns, self._normal)
             elif not self._done:
