@@ -62,6 +62,17 @@ class CoachConfig:
         for field in dataclasses.fields(self):
             if getattr(self, field.name) <= 0:
                 raise ValueError(f"{field.name} is {getattr(self, field.name)}: must be > 0; raise it")
+        if self.reached_share > 1:
+            raise ValueError(f"reached_share is {self.reached_share}: must be ≤ 1, a share of the target; lower it")
+        for name, least, most in (
+            ("touch_n", 0.0, self.reached_share * min(FORCES_N)),  # or a hand at the target would touch nothing
+            ("overload_n", self.reached_share * PRESS_FORCE_N, np.inf),  # or the press would end in a stop
+        ):
+            if not least < getattr(self, name) < most:
+                raise ValueError(
+                    f"{name} is {getattr(self, name)}: must lie between {least:g} and {most:g} N, or no contact is "
+                    "ever complete; correct it"
+                )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -89,6 +89,18 @@ def test_too_much_force_is_told(normal, word):
     assert led(ContactStage(motion="hold", force_n=5), [0, 0, 0, 1, 5, normal])[-1].prompt.startswith(word)
 
 
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"reached_share": 1.5}, "reached_share is 1.5: must be ≤ 1"),
+        ({"touch_n": 1.9}, "touch_n is 1.9: must lie between 0 and 1.9 N"),
+        ({"overload_n": 19.0}, "overload_n is 19.0: must lie between 19 and inf N"),
+    ],
+)
+def test_thresholds_by_which_no_contact_ends_are_refused(given, said):
+    refused(ValueError, said, CoachConfig, **given)
+
+
 def test_the_protocol_is_a_press_and_six_motions_at_three_forces():
     stages = protocol()
     assert stages[0] == ContactStage(motion="press", force_n=20.0)
