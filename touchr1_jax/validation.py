@@ -1,6 +1,7 @@
-"""Range checks for fields of a configuration; NaN is rejected."""
+"""Checks of ranges and names for fields of a configuration; NaN is rejected."""
 
 import math
+from collections.abc import Collection
 from typing import Any
 
 import jax
@@ -43,6 +44,17 @@ def within(config: Any, low: float, high: float, *fields: str) -> None:
         value = getattr(config, field)
         if not low <= value <= high:
             raise ValueError(f"{field} is {value}: must lie in {low} … {high}; change it")
+
+
+def some_of(config: Any, field: str, known: Collection[Any]) -> None:
+    """Check that a field holds some of what is known, each once.
+
+    Raises:
+      ValueError: naming the field, its value and what is known.
+    """
+    names = getattr(config, field)
+    if not names or len({*names}) < len(names) or not {*names} <= {*known}:
+        raise ValueError(f"{field} is {names}: must hold some of {', '.join(known)}, each once; correct it")
 
 
 def unused(config: Any, where: str, **values: Any) -> None:

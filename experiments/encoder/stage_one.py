@@ -19,7 +19,7 @@ stem computes the energies of its filters, from which a random encoder already r
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, get_args
 
 import jax
 import numpy as np
@@ -93,6 +93,7 @@ class StageOneConfig:
     def __post_init__(self) -> None:
         validation.at_least(self, 1, "seeds", "tune_batch")
         validation.at_least(self, 4, "read")
+        validation.some_of(self, "objectives", get_args(Objective))
         for field in ("labelled", "tune_steps"):
             counts = getattr(self, field)
             if not counts or list(counts) != sorted(set(counts)) or counts[0] < 1:

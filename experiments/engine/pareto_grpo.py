@@ -40,6 +40,7 @@ from experiments.engine.job import Job, config_of
 from experiments.engine.peers import JobSize
 from experiments.engine.world_training import TrainingBudget
 from touchr1_jax.rl import config as rl
+from touchr1_jax.validation import at_least, some_of
 
 ALGORITHMS: Mapping[str, rl.AnyAlgorithm] = {
     "paper": rl.Paper(), "stable": rl.Stable(), "DAPO": rl.Dapo(), "Dr. GRPO": rl.DrGrpo(), "GSPO": rl.Gspo(),
@@ -73,14 +74,14 @@ class ParetoGrpoConfig:
     """Training of the options."""
 
     def __post_init__(self) -> None:
-        for field, known in (("algorithms", tuple(ALGORITHMS)), ("options", NAMES)):
-            unknown = [name for name in getattr(self, field) if name not in known]
-            if unknown:
-                raise ValueError(f"{field} holds {unknown}: must be of {', '.join(known)}; correct the names")
+        some_of(self, "algorithms", ALGORITHMS)
+        if self.options:
+            some_of(self, "options", NAMES)
         if self.options and self.option_seeds < 2:
             raise ValueError(f"option_seeds is {self.option_seeds}: must be at least 2 for an interval; raise it")
-        uneven = [g for g in self.groups if self.rollouts % g]
-        if uneven:
+        at_least(self, 1, "rollouts")
+        uneven = [g for g in self.groups if g < 1 or self.rollouts % g]
+        if uneven or not self.groups:
             raise ValueError(f"groups holds {uneven}: must divide rollouts = {self.rollouts}; choose divisors of it")
 
 

@@ -55,7 +55,7 @@ class ScaleConfig:
     """The training, its layouts over devices, and how many of these are compiled.
 
     Raises:
-      ValueError: no mesh, more compiled than there are.
+      ValueError: a size that is not released, no mesh, more compiled than there are.
     """
 
     size: str = "7B"
@@ -71,6 +71,8 @@ class ScaleConfig:
     machine: Machine = Machine()
 
     def __post_init__(self) -> None:
+        if self.size != "tiny":
+            released(self.size)
         if not self.meshes or not 0 <= self.compiled <= len(self.meshes) + 1:
             raise ValueError(
                 f"compiled is {self.compiled}: must be 0 … {len(self.meshes) + 1}, the meshes and the adapters; correct"

@@ -30,9 +30,13 @@ from experiments.engine.world_training import FirstAlarm, TrainingBudget, Varian
 from touchr1_jax.rl.alarms import RULES
 from touchr1_jax.rl.config import GRPOConfig, Stable
 from touchr1_jax.rl.credit_odds import HELPED, HINDERED, credit_odds, false_credit
+from touchr1_jax.validation import some_of
 
 LEAST_NOTICED, MOST_FALSE = 0.9, 0.1  # least share of failed runs whose alarm fires, most of the others
 MARGINS = (0.05, 0.1, 0.13, 0.16, 0.2)  # margins δ of the tactile-use reward whose odds are tabulated
+CODES = tuple(dict.fromkeys(s.code for s in SCENARIOS))
+"""Of all failures."""
+
 Alarms = Mapping[str, FirstAlarm]  # code of each alarm that a run raised → its first time
 
 
@@ -43,8 +47,11 @@ class StabilityGrpoConfig:
     effort: TrainingBudget = TrainingBudget()
     seeds: int = 10
     first_seed: int = 0
-    codes: tuple[str, ...] = tuple(dict.fromkeys(s.code for s in SCENARIOS))
+    codes: tuple[str, ...] = CODES
     most_values: int = 5
+
+    def __post_init__(self) -> None:
+        some_of(self, "codes", CODES)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

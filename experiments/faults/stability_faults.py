@@ -22,7 +22,7 @@ import textwrap
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -85,7 +85,7 @@ class FaultsConfig:
     grpo: KillConfig = KillConfig(kills=KILLS)
     grpo_steps: int = 2000
     study: KillConfig = KillConfig(kills=10, startup_share=0.2)
-    study_scale: str = "default"
+    study_scale: Literal["default", "short"] = "default"
     shared: int = 9  # moments at which one of two studies that begin together on an empty cache is killed
     damaged_files: int | None = None
     flips: int = 1000

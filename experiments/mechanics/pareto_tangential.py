@@ -38,7 +38,8 @@ from experiments.mechanics.tangential_methods import FROM_PRESS, MAIN, METHODS, 
 from experiments.mechanics.tangential_scenes import FrictionContact, FrictionKernels, FrictionSequence
 from sensors_io.scenes import partial_slip
 from sensors_io.scenes.sensors import BODY, SensorModel
-from sensors_io.schema import SENSORS
+from sensors_io.schema import EXPLORATORY, SENSORS
+from touchr1_jax.validation import some_of
 
 TITLES = {
     "force": "Prescribed force",
@@ -85,6 +86,10 @@ class TangentialConfig:
     closed_grid: int = 64
     data_dir: Path | None = None
     seed: int = 11
+
+    def __post_init__(self) -> None:
+        some_of(self, "sensors", SENSORS)
+        some_of(self, "motions", ("press", *EXPLORATORY))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

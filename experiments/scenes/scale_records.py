@@ -37,6 +37,7 @@ from sensors_io.records import RecordStore
 from sensors_io.remote import Mirror
 from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import SENSORS
+from touchr1_jax.validation import above
 
 MOST_OPEN_S, MOST_MB, MOST_FIND_MS, MOST_GROWTH = 3.0, 500.0, 1.0, 1.5
 """Requirements on the index: to open it, its memory, a contact by key, publishing late over publishing early."""
@@ -61,6 +62,9 @@ class AssumedMachine:
     bandwidth_gb_s: float = 1.0  # to the store, of a machine
     latency_ms: float = 30.0  # of a request
     requests_per_s: float = 3500.0  # uploads that the store takes under one prefix, from all machines
+
+    def __post_init__(self) -> None:
+        above(self, 0, "cores", "bandwidth_gb_s", "requests_per_s")
 
     @property
     def described(self) -> str:

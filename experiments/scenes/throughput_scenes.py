@@ -33,6 +33,7 @@ from sensors_io.scenes.protocol import plan
 from sensors_io.scenes.sensors import MODELS
 from sensors_io.schema import MATERIALS, PRESS_FORCE_N, SENSORS
 from touchr1_jax.bench.metrics import ORDINAL
+from touchr1_jax.validation import some_of
 
 PAPER_OBJECTS, PAPER_SEQUENCES, PAPER_FRAMES = 1000, 14_700, 90
 PAPER_RECORDS = PAPER_SEQUENCES * PAPER_FRAMES
@@ -60,6 +61,9 @@ class ThroughputConfig:
     stage_sensors: tuple[str, ...] = SENSORS  # whose parts are timed
     leak_objects: int = PAPER_OBJECTS  # whose labels are predicted from force alone
     threads: int = 2  # that generate
+
+    def __post_init__(self) -> None:
+        some_of(self, "stage_sensors", SENSORS)
 
     def scenes(self, contacts: int, image_px: int) -> SceneConfig:
         """The protocol over so many contacts, with the paper's share of presses."""

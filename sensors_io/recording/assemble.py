@@ -5,6 +5,7 @@ All their times are on one clock: that of the host, less what each sensor is kno
 
 import collections
 import dataclasses
+import itertools
 import pathlib
 from collections.abc import Mapping
 from collections.abc import Sequence as Seq
@@ -17,11 +18,13 @@ from sensors_io.codec import FIELDS, LARGEST
 from sensors_io.errors import MALFORMED, UserError
 from sensors_io.force import ForceError, at_frames
 from sensors_io.recording.journal import JournalEntry, JournalError, read_journal
-from sensors_io.schema import FRAME_ARRAYS, ContactKey, Flag, Sequence
+from sensors_io.schema import FRAME_ARRAYS, ContactKey, Flag, Phase, Sequence
 
 _GAP_PERIODS = 1.5  # between two frames: one is missing
 _GAP_STEPS = 3.0  # of the usual size, where the period is unknown
-_SILENT_S = 1.0  # before the first frame or after the last of a contact: a device is taken as lost sooner
+_SILENT_S = 1.0  # beside a counter that goes on: a device is taken as lost sooner
+_UNSEEN_S = 0.3  # without a frame in a phase, or at either end of a contact: a link is not so late
+_UNSEEN_PERIODS = 3  # of a slow sensor
 _INT64 = np.iinfo(np.int64)
 _KINDS = ("start", "phase", "frame", "force", "end")
 _MADE_HERE = ("frames", "host_time_ns", "device_time_ns", "force_time_ns", "target_force_n", "phase", "flags")
@@ -34,7 +37,7 @@ class Assembled:
     Args:
       sequences: one of each sensor that gave a frame, in the order of the session.
       backgrounds: the gel at rest before the contact, or else after it, uint8 [H, W, 3] by sensor.
-      complete: whether the contact was.
+      complete: whether the contact was, and every sensor that gave frames saw most of each of its phases.
     """
 
     sequences: tuple[Sequence, ...]
@@ -88,10 +91,12 @@ def _assembled(start: Mapping[str, Any], entries: Seq[JournalEntry]) -> Assemble
         backgrounds=backgrounds,
         absent=tuple(s["identity"]["sensor"] for s, f in zip(start["streams"], frames, strict=True) if not f),
     )
+    streams_frames = zip(start["streams"], frames, strict=True)
+    seen = [_sees_all(shared.span_ns[1], entries, own, stream) for stream, own in streams_frames if own]
     return Assembled(
         sequences=tuple(shared.sequence(i, own) for i, own in enumerate(frames) if own),
         backgrounds=backgrounds,
-        complete=bool(end and end["complete"]),
+        complete=bool(end and end["complete"]) and all(seen),
     )
 
 
@@ -101,6 +106,28 @@ def _span_ns(entries: Seq[JournalEntry]) -> tuple[int, int]:
     frames = [e.plain["time_ns"] for e in entries if e.kind == "frame"]
     force = [int(e.arrays["time_ns"][-1]) for e in entries if e.kind == "force"]
     return min(phases or frames), max(phases + frames + force)
+
+
+def _sees_all(until_ns: int, entries: Seq[JournalEntry], frames: Seq[JournalEntry], stream: Mapping[str, Any]) -> bool:
+    """False if the frames of a sensor leave out most of a phase from the first touch on.
+
+    The last phase went on until `until_ns`.
+    """
+    phases = [(e.plain["time_ns"], e.plain["phase"]) for e in entries if e.kind == "phase"]
+    touched = list(itertools.dropwhile(lambda begun: begun[1] == Phase.APPROACH, phases))
+    times = np.sort([e.plain["time_ns"] for e in frames])
+    for since_ns, to_ns in itertools.pairwise([*(time_ns for time_ns, _ in touched), until_ns]):
+        edges = np.array([min(since_ns, times[0]), *times, max(to_ns, times[-1])])
+        gone = np.diff(edges) > _unseen_s(stream["identity"]["period_s"]) * NS_PER_S
+        within_ns = np.minimum(edges[1:], to_ns) - np.maximum(edges[:-1], since_ns)
+        if np.any(gone & (within_ns > (to_ns - since_ns) / 2)):
+            return False
+    return True
+
+
+def _unseen_s(period_s: float | None) -> float:
+    """Seconds without a frame that no late link explains."""
+    return max(_UNSEEN_S, _UNSEEN_PERIODS * (period_s or 0.0))
 
 
 def _with_force(frames: list[JournalEntry], entries: Seq[JournalEntry]) -> list[JournalEntry]:
@@ -194,7 +221,7 @@ class _Shared:
     def _silent_s(self, time_ns: np.ndarray, period_s: float | None) -> list[float]:
         """Seconds without a frame at the beginning and the end of a contact; 0 where that is no gap."""
         silent = (float(time_ns.min() - self.span_ns[0]) / NS_PER_S, float(self.span_ns[1] - time_ns.max()) / NS_PER_S)
-        return [s if s > max(_SILENT_S, 3 * (period_s or 0.0)) else 0.0 for s in silent]
+        return [s if s > _unseen_s(period_s) else 0.0 for s in silent]
 
     def _recording(self, stream: Mapping[str, Any], key: ContactKey, residual_n: float | None) -> dict[str, Any]:
         """Settings of the recording, as JSON."""

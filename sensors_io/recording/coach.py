@@ -5,6 +5,7 @@ tap loads and unloads three times; a hold waits at its force.  The coach sees on
 a prompt, the phase that is under way, and whether to record.
 """
 
+import collections
 import dataclasses
 
 import numpy as np
@@ -20,6 +21,7 @@ _MOVING = {
 }
 
 
+_GLITCH_NS = 10_000_000  # within which the median of the readings counts: one wrong reading is no press and no release
 _REST_S = 1.0  # of free motion, whose first pictures are taken for the gel at rest
 
 
@@ -60,6 +62,17 @@ class CoachConfig:
         for field in dataclasses.fields(self):
             if getattr(self, field.name) <= 0:
                 raise ValueError(f"{field.name} is {getattr(self, field.name)}: must be > 0; raise it")
+        if self.reached_share > 1:
+            raise ValueError(f"reached_share is {self.reached_share}: must be ≤ 1, a share of the target; lower it")
+        for name, least, most in (
+            ("touch_n", 0.0, self.reached_share * min(FORCES_N)),  # or a hand at the target would touch nothing
+            ("overload_n", self.reached_share * PRESS_FORCE_N, np.inf),  # or the press would end in a stop
+        ):
+            if not least < getattr(self, name) < most:
+                raise ValueError(
+                    f"{name} is {getattr(self, name)}: must lie between {least:g} and {most:g} N, or no contact is "
+                    "ever complete; correct it"
+                )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -103,7 +116,7 @@ class Coach:
         self._stage = stage
         self._config = config or CoachConfig()
         self._clear_since_ns: int | None = None
-        self._newest_ns = -(1 << 63)
+        self._latest: collections.deque[tuple[int, float]] = collections.deque()
         self._armed = False
         self._phase = Phase.APPROACH
         self._since_ns = 0
@@ -118,8 +131,12 @@ class Coach:
 
     def step(self, time_ns: int, force_n: np.ndarray) -> Advice:
         """Take one force [3] on the gel into account; one that is not finite, or that a later one overtook, is none."""
-        if np.isfinite(force_n).all() and time_ns >= self._newest_ns:
-            self._normal, self._newest_ns = -float(force_n[2]), time_ns
+        latest = self._latest
+        if np.isfinite(force_n).all() and (not latest or time_ns >= latest[-1][0]):
+            latest.append((time_ns, -float(force_n[2])))
+            while time_ns - latest[0][0] > _GLITCH_NS:
+                latest.popleft()
+            self._normal = sorted(normal for _, normal in latest)[len(latest) // 2]
             if not self._armed:
                 self._arm(time_ns, self._normal)
             elif not self._done:

@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from touchr1_jax.validation import above, at_least, within
+from touchr1_jax.validation import above, at_least, some_of, within
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,6 +27,13 @@ def test_bounds(check, kept, refused, said):
     for value in refused:
         with pytest.raises(ValueError, match=f"share is {value}: {said}"):
             check(Bounded(value))
+
+
+@pytest.mark.parametrize("names", [(), ("a", "a"), ("a", "c")])
+def test_names_are_some_of_those_that_are_known(names):
+    some_of(Bounded(("b", "a")), "share", "ab")
+    with pytest.raises(ValueError, match=r"share is .*: must hold some of a, b, each once; correct it"):
+        some_of(Bounded(names), "share", "ab")
 
 
 def test_a_size_is_finite():

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from touchr1_jax.distributed.memory import FLOAT, HALF, GRPOShape, head_weights, layer_weights
 from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.rl.config import left_out, needs_reference
+from touchr1_jax.validation import above
 
 FORWARD, BACKWARD = 2, 4
 """Operations of a weight and token: a product and a sum; the gradients of the input and of the weight take two such."""
@@ -33,6 +34,9 @@ class Machine:
     989 TFLOP/s in dense bfloat16, 141 GB at 4.8 TB/s, 900 GB/s of NVLink in both directions together (data sheet), and
     one 400 Gb/s adapter a device between machines.  The shares are assumptions: matrix products of large models reach
     40 to 55 % of the peak in training (PaLM, arXiv 2204.02311, appendix B; Llama 3, arXiv 2407.21783, table 4).
+
+    Raises:
+      ValueError: a number that is not above 0.
     """
 
     flops: float = 989e12
@@ -47,6 +51,9 @@ class Machine:
     flops_share: float = 0.4
     read_share: float = 0.7
     link_share: float = 0.7
+
+    def __post_init__(self) -> None:
+        above(self, 0, *(field.name for field in dataclasses.fields(self)))
 
 
 def grpo_work(shape: GRPOShape) -> dict[str, Work]:

@@ -57,6 +57,24 @@ def test_a_force_from_before_the_touch_that_comes_late_is_no_letting_go():
     assert advice[-1].complete
 
 
+@pytest.mark.parametrize(("motion", "at"), [("press", 400), ("hold", 700), ("hold", 1600), ("tap", 300)])
+@pytest.mark.parametrize("wrong_n", [100.0, -100.0])
+def test_one_wrong_reading_is_neither_a_press_nor_a_release(motion, at, wrong_n):
+    """One of 500 a second, while the hand presses, holds, and lets go; what is right comes 4 ms later."""
+    up, down = np.linspace(0, 20, 700), np.linspace(20, 0, 700)
+    normals = np.concatenate([np.zeros(200), up, np.full(300, 20.0), down, np.zeros(20)])
+    ends = []
+    for wrong in (None, at):
+        given = normals.copy()
+        given[[] if wrong is None else wrong] = wrong_n
+        coach = Coach(ContactStage(motion=motion, force_n=20), CONFIG)
+        advice = [coach.step(2_000_000 * k, np.array([0, 0, -n])) for k, n in enumerate(given)]
+        ends.append([(a.phase, a.done) for a in advice])
+        assert not any(a.prompt.startswith("STOP") for a in advice)
+    differing = [k for k, (right, told) in enumerate(zip(*ends, strict=True)) if right != told]
+    assert len(differing) <= 2
+
+
 def test_nothing_begins_while_something_touches():
     assert not any(a.recording for a in led(ContactStage(motion="press", force_n=20), [5] * 20))
 
@@ -69,6 +87,18 @@ def test_letting_go_early_ends_the_contact_incomplete():
 @pytest.mark.parametrize(("normal", "word"), [(23.0, "STOP"), (7.0, "less")])
 def test_too_much_force_is_told(normal, word):
     assert led(ContactStage(motion="hold", force_n=5), [0, 0, 0, 1, 5, normal])[-1].prompt.startswith(word)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"reached_share": 1.5}, "reached_share is 1.5: must be ≤ 1"),
+        ({"touch_n": 1.9}, "touch_n is 1.9: must lie between 0 and 1.9 N"),
+        ({"overload_n": 19.0}, "overload_n is 19.0: must lie between 19 and inf N"),
+    ],
+)
+def test_thresholds_by_which_no_contact_ends_are_refused(given, said):
+    refused(ValueError, said, CoachConfig, **given)
 
 
 def test_the_protocol_is_a_press_and_six_motions_at_three_forces():

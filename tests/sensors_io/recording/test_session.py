@@ -17,7 +17,7 @@ from sensors_io.recording.book import ATTEMPTS, ObjectView
 from sensors_io.recording.coach import CoachConfig, ContactStage, protocol
 from sensors_io.recording.session import SessionConfig, record_session
 from sensors_io.records import RecordsExistError, RecordStore
-from sensors_io.schema import Flag, SchemaError
+from sensors_io.schema import Flag, Phase, SchemaError
 from tests.sensors_io.checks import refused
 from tests.sensors_io.recording.hand import MS, Camera, Hand, Scale, Skin
 
@@ -165,6 +165,29 @@ def test_a_sensor_that_gives_nothing_is_counted(tmp_path):
     hand = Hand()
     report = record_session(tmp_path, SHORT, [Camera(hand), Silent(hand, "digit")], Scale(hand), show=hand.show)
     assert (report.contacts, report.absent) == (2, {"digit": 2})
+
+
+@pytest.mark.parametrize(
+    ("stage", "unseen", "again"),
+    [
+        (ContactStage(motion="slide_x", force_n=2.0), (Phase.MOVE,), 1),
+        (ContactStage(motion="slide_x", force_n=2.0), (Phase.UNLOAD,), 0),
+        (ContactStage(motion="tap", force_n=20.0), (Phase.LOAD, Phase.UNLOAD), 1),
+    ],
+)
+def test_a_contact_of_which_a_camera_saw_too_little_is_asked_for_again(tmp_path, stage, unseen, again):
+    """A motion of half a second but its first moment, not a release of 20 ms; taps whose presses are short."""
+
+    class Blinking(Camera):
+        def drain(self):
+            samples, shown = super().drain(), self.hand.shown
+            gone = shown is not None and not self.hand.contacts and shown.advice.phase in unseen
+            return [] if gone else samples
+
+    config = dataclasses.replace(CONFIG, coach=dataclasses.replace(CONFIG.coach, move_s=0.5), stages=(stage,))
+    hand = Hand()
+    report = record_session(tmp_path, config, [Camera(hand), Blinking(hand, "digit")], Scale(hand), show=hand.show)
+    assert (report.contacts, report.incomplete) == (1 + again, again)
 
 
 def test_the_gel_at_rest_and_the_object_are_kept(tmp_path):

@@ -63,6 +63,12 @@ def test_what_prompts_gather_is_there_for_sampling():
     assert work["sampling"].gathered_bytes == 0
 
 
+@pytest.mark.parametrize("field", ["flops", "far_bytes", "link_share"])
+def test_a_machine_that_does_nothing_is_refused(field):
+    with pytest.raises(ValueError, match=f"{field} is 0.0: must be above 0; raise it"):
+        Machine(**{field: 0.0})
+
+
 def test_a_phase_takes_its_longest_part_and_then_its_sums():
     machine = Machine(
         flops=10.0, read_bytes=5.0, near_bytes=4.0, far_bytes=1.0, flops_share=1.0, read_share=1.0, link_share=1.0

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 from touchr1_jax.models.decoder_config import DecoderConfig, Qwen3DecoderConfig
+from touchr1_jax.validation import at_least
 
 CONFIG_FILE = "config.json"
 COLOURS = 3
@@ -28,7 +29,7 @@ class TowerConfig:
     A patch is `patch_px`² pixels of `patch_frames` frames; `merge`² patches become one token of `out_size` channels.
 
     Raises:
-      ValueError: heads that do not divide the width or cannot turn in two axes.
+      ValueError: a size below 1, heads that do not divide the width or cannot turn in two axes.
     """
 
     model_type: ClassVar[ModelType]
@@ -46,6 +47,7 @@ class TowerConfig:
     merge: int = 2
 
     def __post_init__(self) -> None:
+        at_least(self, 1, "hidden_size", "num_heads", "patch_px", "patch_frames", "merge")
         if self.hidden_size % (4 * self.num_heads):
             raise ValueError(
                 f"vision hidden_size {self.hidden_size} must be a multiple of 4 · num_heads = {4 * self.num_heads}: "

@@ -121,6 +121,12 @@ def test_what_is_not_computed_is_refused(change, message):
         parse_config(SEVEN_B | change)
 
 
+@pytest.mark.parametrize("field", ["hidden_size", "num_heads", "patch_px", "patch_frames", "merge"])
+def test_a_tower_without_heads_or_patches_is_refused(field):
+    with pytest.raises(ValueError, match=f"{field} is 0: must be at least 1; raise it"):
+        dataclasses.replace(released("7B").vision, **{field: 0})
+
+
 @pytest.mark.parametrize("field", [*TEXT[:8], "rope_theta", "rope_scaling", "image_token_id", "vision_config"])
 def test_missing_field_is_named(field):
     with pytest.raises(ValueError, match=rf"config\.json lacks {field}"):
