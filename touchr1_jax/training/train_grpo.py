@@ -80,6 +80,8 @@ def train_grpo(
     check_whole_batch(policy.fns, start, batches, config, hooks, noise, seed)
     base = {name: tree for name, tree in start.items() if policy.fns.lora.rank and name != ADAPTERS}
     trained = {name: tree for name, tree in start.items() if name not in base}
+    if policy.fns.cache_dtype == jnp.float32:  # else the base has 16 bits already, or is packed
+        base = at_precision(config, base)
     state = start_state(trained, optimizer, jax.random.key(seed), config)
     constants = FrozenInputs(reference=at_precision(config, trained), noise=noise), base
     step, state, batches = hooks.devices.shard(step, state, batches, config.drawn, *constants)
