@@ -71,16 +71,8 @@ def train_grpo(
     """
     constraint = policy.constraint if config.algorithm.constrained else None
     levels = None if config.algorithm.enumerated is None else policy.level_tokens
-    optimizer, step = grpo_program(
-        policy.fns,
-        score,
-        config,
-        loop.steps,
-        constraint,
-        hooks.devices.gather_params,
-        levels,
-        hooks.sampled is not None,
-    )
+    gather, sampled = hooks.devices.gather_params, hooks.sampled is not None
+    optimizer, step = grpo_program(policy.fns, score, config, loop.steps, constraint, gather, levels, sampled)
     whole = with_adapters(params, policy.fns.lora, params, seed)
     start = of_decoder(whole)
     check_whole_batch(policy.fns, start, batches, config, hooks, noise, seed)

@@ -83,7 +83,7 @@ def test_a_bare_function_in_the_dictionary_is_named():
 
 def test_a_segment_that_there_is_not_is_named():
     with pytest.raises(
-        RewardError, match=r"rewards\[mine\].settled is 'concluded': must be in perceive, compare, conc"
+        RewardError, match=r"rewards\[mine\].settled is 'concluded': must be one of perceive, compare, con"
     ):
         check_weights({"mine": Reward(lambda p, t: jnp.ones(()), settled="concluded")}, {"mine": 1.0})
 
