@@ -7,12 +7,13 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.errors import ConcretizationTypeError, TracerArrayConversionError
+from jax.errors import ConcretizationTypeError, TracerArrayConversionError, TracerIntegerConversionError
 from jaxtyping import Array, Bool, Float, Int
 
+from touchr1_jax.text.language import SEGMENTS
 from touchr1_jax.types import Parsed, Target
 
-UNTRACEABLE = (ConcretizationTypeError, TracerArrayConversionError)
+UNTRACEABLE = (ConcretizationTypeError, TracerArrayConversionError, TracerIntegerConversionError)
 """Errors of JAX where Python or NumPy needs a number that the compiled program will compute."""
 
 
@@ -181,8 +182,8 @@ def check_weights(rewards: Mapping[str, AnyReward], weights: Mapping[str, float]
     """Check the names and sizes of weights.
 
     Raises:
-      RewardError: an unknown or reserved name, an entry that is no `Reward`, a weight that is negative or beyond
-        float32, or none above 0.
+      RewardError: an unknown or reserved name, an entry that is no `Reward` or has an unknown segment, a weight that is
+        negative or beyond float32, or none above 0.
     """
     for name, weight in weights.items():
         if name in RESERVED:
@@ -191,6 +192,11 @@ def check_weights(rewards: Mapping[str, AnyReward], weights: Mapping[str, float]
             raise RewardError(f"weights: no reward is called {name!r}; choose from {', '.join(sorted(rewards))}")
         if not isinstance(rewards[name], AnyReward):
             raise RewardError(f"rewards[{name}] is {rewards[name]!r}: must be a Reward; write Reward(function)")
+        settled = getattr(rewards[name], "settled", SEGMENTS[-1])
+        if settled not in SEGMENTS:
+            raise RewardError(
+                f"rewards[{name}].settled is {settled!r}: must be one of {', '.join(SEGMENTS)}; write one"
+            )
         if not (weight == 0 or SMALLEST_WEIGHT <= weight <= LARGEST_WEIGHT):
             raise RewardError(
                 f"weights[{name}] is {weight}: must be finite and ≥ 0, and {SMALLEST_WEIGHT} … {LARGEST_WEIGHT} if "

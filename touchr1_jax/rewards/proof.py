@@ -3,7 +3,9 @@
 import dataclasses
 import functools
 import itertools
-from collections.abc import Iterable, Mapping
+import re
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,13 +13,18 @@ import numpy as np
 from jaxtyping import Array
 
 from touchr1_jax.rewards.base import AnyReward, GroupReward, HostReward, Reward, RewardError
+from touchr1_jax.text.language import SEGMENTS
 from touchr1_jax.types import Parsed, Target
+
+_LEVELS = (-1, 0, 1, 2)
 
 
 def prove_rewards(
     rewards: Mapping[str, AnyReward], names: Iterable[str], sensors: int, attributes: int, length: int = 20
 ) -> None:
     """Evaluate rewards on extreme answers and targets; once for each reward and size.
+
+    They must be finite, the same function each time, and known where they say that they are settled.
 
     Answers: every slot ⊥, lowest or highest, or sensors that disagree; formatted or not, cut off or not, of no, one or
     twenty tokens.  Targets: no attribute asked, one or all; labels unknown, lowest or highest of two, three or nine
@@ -31,18 +38,33 @@ def prove_rewards(
       length: T, tokens of a completion.
 
     Raises:
-      RewardError: NaN or infinity; it names the reward, the answer and the target.
+      RewardError: NaN or infinity, with the answer and the target; another function each time; a value that changes
+        after the segment where it is settled; a reward without a hash.  It names the reward.
     """
     for name in names:
-        if not isinstance(rewards[name], HostReward):
-            _prove(name, rewards[name], sensors, attributes, length)
+        if isinstance(rewards[name], HostReward):
+            continue
+        try:
+            hash(rewards[name])
+        except TypeError as error:
+            needs = "must have a hash, by which it is checked once; write @dataclass(frozen=True), or a function"
+            raise RewardError(f"reward {name!r}: {error}, {needs}") from error
+        _prove(name, rewards[name], sensors, attributes, length)
 
 
 @functools.cache
 def _prove(name: str, reward: Reward | GroupReward, sensors: int, attributes: int, length: int) -> None:
+    early = reward.settled if isinstance(reward, Reward) else SEGMENTS[-1]
+    values_of = lambda answers, targets: _values(reward, answers, targets, length)
     with jax.ensure_compile_time_eval():
         answers, targets = _answers(sensors, attributes), _targets(sensors, attributes)
-        values = np.asarray(jax.jit(lambda a, t: _values(reward, a, t, length))(answers, targets))
+        values = changed = np.asarray(jax.jit(values_of)(answers, targets))
+        if early != SEGMENTS[-1]:
+            changed = np.asarray(jax.jit(values_of)(_changed_after(early, answers), targets))
+        one, target = jax.tree.map(lambda x: np.asarray(x)[0], (answers, targets))
+        group = np.zeros((len(answers.length), length), np.int32), answers
+        of = (one, target) if isinstance(reward, Reward) else (*group, target)
+        once, again = (_written(reward.value, *of) for _ in range(2))
     bad = np.argwhere(~np.isfinite(values))
     if len(bad):
         a, t = bad[0]
@@ -51,6 +73,31 @@ def _prove(name: str, reward: Reward | GroupReward, sensors: int, attributes: in
             f"reward {name!r} is {values[a, t]} for {plain(answers, a)} against {plain(targets, t)}: must be finite "
             "everywhere; choose with jnp.where before you divide or take logarithms"
         )
+    if once != again:
+        raise RewardError(
+            f"reward {name!r} is another function each time: must be pure, because a step traces it once, so that its "
+            "random numbers, counters and clocks stand still; compute from the arguments alone"
+        )
+    if not np.allclose(values, changed, rtol=1e-4, atol=1e-6):  # up to rounding
+        raise RewardError(
+            f"reward {name!r} is settled by {early!r}, but what follows changes it: must be known there, or later "
+            f"tokens get no credit for it; leave settled at {SEGMENTS[-1]!r}"
+        )
+
+
+def _written(value: Callable[..., Array], *of: Any) -> tuple[str, list[bytes]]:
+    """The operations and numbers of a function, traced anew, without addresses in memory."""
+    program = jax.make_jaxpr(lambda *of: value(*of))(*of)
+    return re.sub(r"0x[0-9a-f]+", "", str(program.jaxpr)), [np.asarray(x).tobytes() for x in program.consts]
+
+
+def _changed_after(segment: str, answers: Parsed) -> Parsed:
+    """The answers with other levels after a segment, and another end."""
+    later = SEGMENTS[SEGMENTS.index(segment) + 1 :]
+    another = lambda x: jnp.roll(x, len(x) // len(_LEVELS), 0)
+    slots = {name: another(getattr(answers, name)) for name in later}
+    ends = {"formatted": ~answers.formatted, "truncated": ~answers.truncated, "length": jnp.roll(answers.length, 1)}
+    return dataclasses.replace(answers, **slots, **ends)
 
 
 def _values(reward: Reward | GroupReward, answers: Parsed, targets: Target, length: int) -> Array:
@@ -72,7 +119,7 @@ def _values(reward: Reward | GroupReward, answers: Parsed, targets: Target, leng
 
 
 def _answers(sensors: int, attributes: int) -> Parsed:
-    cases = itertools.product((-1, 0, 1, 2), (False, True), (False, True), (0, 1, 20))
+    cases = itertools.product(_LEVELS, (False, True), (False, True), (0, 1, 20))
     level, formatted, truncated, length = (np.array(x) for x in zip(*cases, strict=True))
     slots = np.tile(level[:, None], attributes)
     disagreeing = np.arange(sensors)[:, None] % 2

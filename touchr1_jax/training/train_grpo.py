@@ -71,15 +71,15 @@ def train_grpo(
     """
     constraint = policy.constraint if config.algorithm.constrained else None
     levels = None if config.algorithm.enumerated is None else policy.level_tokens
-    gather = hooks.devices.gather_params
-    optimizer, step = grpo_program(
-        policy.fns, score, config, loop.steps, constraint, gather, levels, hooks.sampled is not None
-    )
+    gather, sampled = hooks.devices.gather_params, hooks.sampled is not None
+    optimizer, step = grpo_program(policy.fns, score, config, loop.steps, constraint, gather, levels, sampled)
     whole = with_adapters(params, policy.fns.lora, params, seed)
     start = of_decoder(whole)
     check_whole_batch(policy.fns, start, batches, config, hooks, noise, seed)
     base = {name: tree for name, tree in start.items() if policy.fns.lora.rank and name != ADAPTERS}
     trained = {name: tree for name, tree in start.items() if name not in base}
+    # released weights have 16 bits already, or are packed
+    base = at_precision(config, base) if policy.fns.cache_dtype == jnp.float32 else base
     state = start_state(trained, optimizer, jax.random.key(seed), config)
     constants = FrozenInputs(reference=at_precision(config, trained), noise=noise), base
     step, state, batches = hooks.devices.shard(step, state, batches, config.drawn, *constants)

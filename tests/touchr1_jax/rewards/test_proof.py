@@ -1,6 +1,8 @@
 """Rewards at the corners of what can be answered, asked and felt: all finite, or named before training."""
 
+import dataclasses
 import itertools
+import random
 
 import jax.numpy as jnp
 import numpy as np
@@ -64,3 +66,51 @@ def test_corners_are_those_of_the_docstring():
 
 def test_a_reward_on_the_host_is_not_called_before_training():
     prove_rewards({"mine": HostReward(lambda text, parsed, target: np.nan)}, ["mine"], S, A)
+
+
+CALLS = itertools.count(1)
+
+
+@pytest.mark.parametrize(
+    "reward",
+    [
+        Reward(lambda p, t: random.random() * p.formatted),
+        Reward(lambda p, t: p.length / next(CALLS)),
+        GroupReward(lambda tokens, p, t: jnp.asarray(np.random.default_rng().random(len(tokens)), jnp.float32)),
+    ],
+    ids=["a random number", "a counter", "random numbers of a group"],
+)
+def test_a_reward_that_is_not_pure_is_named(reward):
+    """A step would trace it once: every answer of a whole run would get the same random number."""
+    with pytest.raises(RewardError, match="reward 'mine' is another function each time: must be pure"):
+        prove_rewards({"mine": reward}, ["mine"], S, A)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("segment", "value"),
+    [
+        ("perceive", lambda p, t: 1.0 * (p.compare[0] == 1)),
+        ("compare", lambda p, t: 1.0 * (p.conclude[0] == t.label[0])),
+        ("compare", lambda p, t: jnp.where(p.truncated, 0.0, 1.0 * p.perceive[0, 0])),
+    ],
+)
+def test_a_reward_is_known_where_it_is_settled(segment, value):
+    prove_rewards({"mine": Reward(lambda p, t: 1.0 * p.perceive[0, 0], settled=segment)}, ["mine"], S, A)
+    with pytest.raises(RewardError, match=f"reward 'mine' is settled by '{segment}', but what follows changes it"):
+        prove_rewards({"mine": Reward(value, settled=segment)}, ["mine"], S, A)
+
+
+@dataclasses.dataclass
+class Brevity:
+    """A reward with a setting, as people write it: equal ones are equal, so that it has no hash."""
+
+    longest: int = 20
+
+    def __call__(self, parsed, target):
+        return 1.0 - parsed.length / self.longest
+
+
+def test_a_reward_without_a_hash_is_named():
+    with pytest.raises(RewardError, match="reward 'mine': unhashable type: 'Brevity', must have a hash"):
+        prove_rewards({"mine": Reward(Brevity())}, ["mine"], S, A)

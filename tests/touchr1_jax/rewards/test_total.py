@@ -81,6 +81,13 @@ def test_a_bare_function_in_the_dictionary_is_named():
         check_weights({"mine": lambda p, t: jnp.ones(())}, {"mine": 1.0})
 
 
+def test_a_segment_that_there_is_not_is_named():
+    with pytest.raises(
+        RewardError, match=r"rewards\[mine\].settled is 'concluded': must be one of perceive, compare, con"
+    ):
+        check_weights({"mine": Reward(lambda p, t: jnp.ones(()), settled="concluded")}, {"mine": 1.0})
+
+
 @pytest.mark.parametrize(
     ("reward", "message"),
     [
@@ -101,6 +108,7 @@ def test_a_bare_function_in_the_dictionary_is_named():
             r"reward 'mine': value cannot be traced, .*test_total\.py:\d+ needs .*jnp\.where .*HostReward",
         ),
         (Reward(lambda p, t: np.mean(np.asarray(p.conclude))), r"reward 'mine': value cannot be traced, .*jnp instead"),
+        (Reward(lambda p, t: [0.1, 0.2, 1.0][p.conclude[0]]), r"reward 'mine': value cannot be traced, .*jnp instead"),
     ],
 )
 def test_bad_rewards_fail_when_traced(reward, message):

@@ -2,14 +2,19 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from tests.touchr1_jax import tiny
-from touchr1_jax.rl.config import GRPOConfig
-from touchr1_jax.training.loop import Hooks, SingleDevice
-from touchr1_jax.training.train_grpo import check_whole_batch
+from tests.touchr1_jax.distributed.problems import score
+from touchr1_jax.models.lora import LoraConfig
+from touchr1_jax.models.touch_policy import ModelConfig, TouchPolicy
+from touchr1_jax.rl.config import GRPOConfig, Paper
+from touchr1_jax.text.parser import compile_parser
+from touchr1_jax.training.loop import Hooks, LoopConfig, SingleDevice
+from touchr1_jax.training.train_grpo import check_whole_batch, train_grpo
 
 P = 3
 CONFIG = GRPOConfig(prompts=P, micro_prompts=P, length=3)
@@ -71,3 +76,27 @@ def test_lean_compilation_is_refused_on_a_mesh_which_would_ignore_it():
     config = dataclasses.replace(CONFIG, lean_compilation=True)
     with pytest.raises(ValueError, match=r"lean_compilation is True: must be False on a mesh of \(2, 1, 1\)"):
         check_whole_batch(tiny.SHALLOW, {}, Repeated(WHOLE), config, Hooks(devices=devices), NOISE, 0)
+
+
+@pytest.mark.long
+def test_adapters_on_a_base_of_32_bits_learn_in_bfloat16():
+    """The base is frozen, but computed with: its keys did not fit into the caches of the sampler."""
+    fns = dataclasses.replace(tiny.SHALLOW, lora=LoraConfig(rank=2, targets=("v_proj",)))
+    parser = compile_parser(tiny.LANGUAGE, tiny.TOKENIZER)
+    words = {"language": tiny.LANGUAGE, "tokenizer": tiny.TOKENIZER, "layout": tiny.LAYOUT, "parser": parser}
+    config = dataclasses.replace(CONFIG, group=2, bfloat16=True, algorithm=Paper(gamma=0.0))
+    metrics = []
+    after = train_grpo(
+        TouchPolicy(model=ModelConfig(), fns=fns, **words),
+        tiny.shallow_params(0),
+        Repeated(WHOLE),
+        score,
+        config,
+        LoopConfig(steps=1),
+        Hooks(log=lambda _, found: metrics.append(found)),
+        noise=NOISE,
+    )
+    assert {x.dtype for x in jax.tree.leaves(after)} == {jnp.dtype(jnp.float32)}
+    np.testing.assert_array_equal(after["decoder"]["norm"]["scale"], tiny.shallow_params(0)["decoder"]["norm"]["scale"])
+    assert metrics[0]["clip_share"] == 0
+    assert 0 < metrics[0]["sampler_gap"] < 0.1
