@@ -47,7 +47,7 @@ def prove_rewards(
         try:
             hash(rewards[name])
         except TypeError as error:
-            needs = "must have a hash, by which it is checked once; write @dataclass(frozen=True), or a function"
+            needs = "must have a hash, by which it is checked once; write @dataclass(eq=False), or a function"
             raise RewardError(f"reward {name!r}: {error}, {needs}") from error
         _prove(name, rewards[name], sensors, attributes, length)
 
@@ -88,7 +88,8 @@ def _prove(name: str, reward: Reward | GroupReward, sensors: int, attributes: in
 def _written(value: Callable[..., Array], *of: Any) -> tuple[str, list[bytes]]:
     """The operations and numbers of a function, traced anew, without addresses in memory."""
     program = jax.make_jaxpr(lambda *of: value(*of))(*of)
-    return re.sub(r"0x[0-9a-f]+", "", str(program.jaxpr)), [np.asarray(x).tobytes() for x in program.consts]
+    plain = lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+    return re.sub(r"0x[0-9a-f]+", "", str(program.jaxpr)), [np.asarray(plain(x)).tobytes() for x in program.consts]
 
 
 def _changed_after(segment: str, answers: Parsed) -> Parsed:
