@@ -132,9 +132,9 @@ def _until_ns(span_ns: tuple[int, int], stream: Mapping[str, Any]) -> int:
 
 
 def _unseen_s(period_s: float | None, time_ns: np.ndarray) -> float:
-    """Seconds without a frame that no late link explains; where the period is unknown, it is the usual step."""
+    """Seconds without a frame that no late link explains; the usual step may be longer than the period that is told."""
     step_s = float(np.median(np.diff(np.sort(time_ns)))) / NS_PER_S if len(time_ns) > 1 else 0.0
-    return max(_UNSEEN_S, _UNSEEN_PERIODS * (period_s or step_s))
+    return max(_UNSEEN_S, _UNSEEN_PERIODS * max(period_s or 0.0, step_s))
 
 
 def _with_force(frames: list[JournalEntry], entries: Seq[JournalEntry]) -> list[JournalEntry]:

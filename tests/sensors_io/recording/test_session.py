@@ -200,6 +200,12 @@ class Slow(Camera):
         return [s for s in super().drain() if s.index % 50 == 0]
 
 
+class Dark(Slow):
+    """As many of a camera that promises a hundred, and exposes for half a second in the dark."""
+
+    identity = Camera.identity
+
+
 class Late(Camera):
     """A camera whose program gives, and stamps, frames half a second after they were taken."""
 
@@ -207,7 +213,7 @@ class Late(Camera):
         return [dataclasses.replace(s, index=s.index - 50) for s in super().drain() if s.index > 50]
 
 
-@pytest.mark.parametrize(("second", "late_s"), [(Slow, 0.0), (Late, 0.5)])
+@pytest.mark.parametrize(("second", "late_s"), [(Slow, 0.0), (Dark, 0.0), (Late, 0.5)])
 def test_a_healthy_sensor_that_is_slow_or_late_completes_its_contacts(tmp_path, second, late_s):
     """The last half second of the late one comes when the contact is over."""
     coach = dataclasses.replace(CONFIG.coach, clear_s=2.0)
