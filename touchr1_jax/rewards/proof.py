@@ -1,4 +1,4 @@
-"""A check before training that rewards are finite for extreme answers and targets."""
+"""Checks before training that rewards are finite for extreme answers and targets, and pure."""
 
 import dataclasses
 import functools
@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental import checkify
 from jaxtyping import Array
 
 from touchr1_jax.rewards.base import AnyReward, GroupReward, HostReward, Reward, RewardError
@@ -24,7 +25,8 @@ def prove_rewards(
 ) -> None:
     """Evaluate rewards on extreme answers and targets; once for each reward and size.
 
-    They must be finite, the same function each time, and known where they say that they are settled.
+    They must be finite, the same function each time, without an index beyond its array, and known where they say that
+    they are settled.
 
     Answers: every slot ⊥, lowest or highest, or sensors that disagree; formatted or not, cut off or not, of no, one or
     twenty tokens.  Targets: no attribute asked, one or all; labels unknown, lowest or highest of two, three or nine
@@ -38,8 +40,8 @@ def prove_rewards(
       length: T, tokens of a completion.
 
     Raises:
-      RewardError: NaN or infinity, with the answer and the target; another function each time; a value that changes
-        after the segment where it is settled; a reward without a hash.  It names the reward.
+      RewardError: NaN or infinity, with the answer and the target; another function each time; an index beyond an
+        array; a value that changes after the segment where it is settled; no hash.  It names the reward.
     """
     for name in names:
         if isinstance(rewards[name], HostReward):
@@ -54,17 +56,22 @@ def prove_rewards(
 
 @functools.cache
 def _prove(name: str, reward: Reward | GroupReward, sensors: int, attributes: int, length: int) -> None:
-    early = reward.settled if isinstance(reward, Reward) else SEGMENTS[-1]
-    values_of = lambda answers, targets: _values(reward, answers, targets, length)
     with jax.ensure_compile_time_eval():
         answers, targets = _answers(sensors, attributes), _targets(sensors, attributes)
-        values = changed = np.asarray(jax.jit(values_of)(answers, targets))
-        if early != SEGMENTS[-1]:
-            changed = np.asarray(jax.jit(values_of)(_changed_after(early, answers), targets))
-        one, target = jax.tree.map(lambda x: np.asarray(x)[0], (answers, targets))
-        group = np.zeros((len(answers.length), length), np.int32), answers
-        of = (one, target) if isinstance(reward, Reward) else (*group, target)
-        once, again = (_written(reward.value, *of) for _ in range(2))
+        of_all = jax.jit(lambda answers, targets: _values(reward, answers, targets, length))
+        values = np.asarray(of_all(answers, targets))
+        _require_finite(name, values, answers, targets)
+        _require_pure(name, reward, answers, targets, length)
+        if isinstance(reward, Reward) and reward.settled != SEGMENTS[-1]:
+            changed = np.asarray(of_all(_changed_after(reward.settled, answers), targets))
+            if not np.allclose(values, changed, rtol=1e-4, atol=1e-6):  # up to rounding
+                raise RewardError(
+                    f"reward {name!r} is settled by {reward.settled!r}, but what follows changes it: must be known "
+                    f"there, or later tokens get no credit for it; leave settled at {SEGMENTS[-1]!r}"
+                )
+
+
+def _require_finite(name: str, values: np.ndarray, answers: Parsed, targets: Target) -> None:
     bad = np.argwhere(~np.isfinite(values))
     if len(bad):
         a, t = bad[0]
@@ -73,15 +80,28 @@ def _prove(name: str, reward: Reward | GroupReward, sensors: int, attributes: in
             f"reward {name!r} is {values[a, t]} for {plain(answers, a)} against {plain(targets, t)}: must be finite "
             "everywhere; choose with jnp.where before you divide or take logarithms"
         )
+
+
+def _require_pure(name: str, reward: Reward | GroupReward, answers: Parsed, targets: Target, length: int) -> None:
+    """Trace a reward twice, for levels that every attribute has; if it looks elements up, check their indices."""
+    lowest = int(np.argmax(np.asarray(answers.compare)[:, 0] == 0))
+    alike = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x)[lowest], x.shape), answers)
+    one, target = (jax.tree.map(lambda x: np.asarray(x)[0], tree) for tree in (alike, targets))
+    of = (one,) if isinstance(reward, Reward) else (np.zeros((len(alike.length), length), np.int32), alike)
+    once, again = (_written(reward.value, *of, target) for _ in range(2))
     if once != again:
         raise RewardError(
             f"reward {name!r} is another function each time: must be pure, because a step traces it once, so that its "
             "random numbers, counters and clocks stand still; compute from the arguments alone"
         )
-    if not np.allclose(values, changed, rtol=1e-4, atol=1e-6):  # up to rounding
+    if not re.search(r"\b(gather|dynamic_slice)\[", once[0]):  # a constant index inside its array needs neither
+        return
+    outside = jax.jit(checkify.checkify(reward.value, errors=checkify.index_checks))(*of, target)[0].get()
+    if outside:
+        sensors, attributes = one.perceive.shape
         raise RewardError(
-            f"reward {name!r} is settled by {early!r}, but what follows changes it: must be known there, or later "
-            f"tokens get no credit for it; leave settled at {SEGMENTS[-1]!r}"
+            f"reward {name!r}: {outside.splitlines()[0].split(': ', 1)[-1].rstrip('. ')}: must lie inside, or a step "
+            f"reads another element; there are {sensors} sensors and {attributes} attributes"
         )
 
 

@@ -87,6 +87,33 @@ def test_a_reward_that_is_not_pure_is_named(reward):
         prove_rewards({"mine": reward}, ["mine"], S, A)
 
 
+@pytest.mark.parametrize(
+    ("reward", "wrong"),
+    [
+        (
+            Reward(lambda p, t: 1.0 * (p.perceive[2, 0] == t.label[0])),
+            "index 2 is out of bounds for axis 0 with size 2",
+        ),
+        (Reward(lambda p, t: 1.0 * t.asked[A]), "index 4 is out of bounds for axis 0 with size 4"),
+        (GroupReward(lambda tokens, p, t: 1.0 * p.conclude[:, A]), "index 4 is out of bounds for axis 1 with size 4"),
+    ],
+    ids=["a sensor", "an attribute", "an attribute of a group"],
+)
+def test_an_index_beyond_the_end_is_named(reward, wrong):
+    """JAX would read the last element."""
+    with pytest.raises(RewardError, match=f"reward 'mine': {wrong}: must lie inside"):
+        prove_rewards({"mine": reward}, ["mine"], 2, A)
+
+
+def test_levels_may_be_looked_up():
+    table = jnp.array([[0.0, 0.5]] * A)  # of two levels
+    rewards = {
+        "one": Reward(lambda p, t: table[-1, p.conclude[-1]]),
+        "many": GroupReward(lambda tokens, p, t: table[0, p.conclude[:, 0]]),
+    }
+    prove_rewards(rewards, rewards, S, A)
+
+
 @pytest.mark.long
 def test_random_numbers_of_a_fixed_key_are_pure():
     """The key is a constant of the program, of a type that NumPy does not have."""
