@@ -101,7 +101,7 @@ def _require_pure(name: str, reward: Reward | GroupReward, answers: Parsed, targ
         sensors, attributes = one.perceive.shape
         raise RewardError(
             f"reward {name!r}: {outside.splitlines()[0].split(': ', 1)[-1].rstrip('. ')}: must lie inside, or a step "
-            f"reads another element; there are {sensors} sensors and {attributes} attributes"
+            f"reads another element; bound it by jnp.clip: there are {sensors} sensors and {attributes} attributes"
         )
 
 
