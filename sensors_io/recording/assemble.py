@@ -92,7 +92,7 @@ def _assembled(start: Mapping[str, Any], entries: Seq[JournalEntry]) -> Assemble
         absent=tuple(s["identity"]["sensor"] for s, f in zip(start["streams"], frames, strict=True) if not f),
     )
     streams_frames = zip(start["streams"], frames, strict=True)
-    seen = [_sees_all(shared.span_ns[1], entries, own, stream) for stream, own in streams_frames if own]
+    seen = [_sees_all(_until_ns(shared.span_ns, stream), entries, own, stream) for stream, own in streams_frames if own]
     return Assembled(
         sequences=tuple(shared.sequence(i, own) for i, own in enumerate(frames) if own),
         backgrounds=backgrounds,
@@ -111,23 +111,30 @@ def _span_ns(entries: Seq[JournalEntry]) -> tuple[int, int]:
 def _sees_all(until_ns: int, entries: Seq[JournalEntry], frames: Seq[JournalEntry], stream: Mapping[str, Any]) -> bool:
     """False if the frames of a sensor leave out most of a phase from the first touch on.
 
-    The last phase went on until `until_ns`.
+    What was after `until_ns` is left out of account.
     """
     phases = [(e.plain["time_ns"], e.plain["phase"]) for e in entries if e.kind == "phase"]
     touched = list(itertools.dropwhile(lambda begun: begun[1] == Phase.APPROACH, phases))
     times = np.sort([e.plain["time_ns"] for e in frames])
-    for since_ns, to_ns in itertools.pairwise([*(time_ns for time_ns, _ in touched), until_ns]):
+    begun_ns = [min(time_ns, until_ns) for time_ns, _ in touched]
+    for since_ns, to_ns in itertools.pairwise([*begun_ns, until_ns]):
         edges = np.array([min(since_ns, times[0]), *times, max(to_ns, times[-1])])
-        gone = np.diff(edges) > _unseen_s(stream["identity"]["period_s"]) * NS_PER_S
+        gone = np.diff(edges) > _unseen_s(stream["identity"]["period_s"], times) * NS_PER_S
         within_ns = np.minimum(edges[1:], to_ns) - np.maximum(edges[:-1], since_ns)
         if np.any(gone & (within_ns > (to_ns - since_ns) / 2)):
             return False
     return True
 
 
-def _unseen_s(period_s: float | None) -> float:
-    """Seconds without a frame that no late link explains."""
-    return max(_UNSEEN_S, _UNSEEN_PERIODS * (period_s or 0.0))
+def _until_ns(span_ns: tuple[int, int], stream: Mapping[str, Any]) -> int:
+    """Last moment of a contact that a sensor could tell of: what is stamped late came when it was over."""
+    return span_ns[1] - max(0, round(stream["late_s"] * NS_PER_S))
+
+
+def _unseen_s(period_s: float | None, time_ns: np.ndarray) -> float:
+    """Seconds without a frame that no late link explains; the usual step may be longer than the period that is told."""
+    step_s = float(np.median(np.diff(np.sort(time_ns)))) / NS_PER_S if len(time_ns) > 1 else 0.0
+    return max(_UNSEEN_S, _UNSEEN_PERIODS * max(period_s or 0.0, step_s))
 
 
 def _with_force(frames: list[JournalEntry], entries: Seq[JournalEntry]) -> list[JournalEntry]:
@@ -177,7 +184,7 @@ class _Shared:
         own = _own_arrays(frames)
         gaps = _gaps(time_ns, [e.plain["index"] for e in frames], identity["period_s"])
         gaps |= time_ns < np.maximum.accumulate(time_ns)  # by a wrong stamp
-        silent_s = self._silent_s(time_ns, identity["period_s"])
+        silent_s = self._silent_s(time_ns, stream)
         gaps[0] |= silent_s[0] > 0
         gaps[-1] |= silent_s[1] > 0
         force = _Force.at(time_ns, self.entries if number == 0 else ())
@@ -218,10 +225,11 @@ class _Shared:
             **arrays,
         )
 
-    def _silent_s(self, time_ns: np.ndarray, period_s: float | None) -> list[float]:
+    def _silent_s(self, time_ns: np.ndarray, stream: Mapping[str, Any]) -> list[float]:
         """Seconds without a frame at the beginning and the end of a contact; 0 where that is no gap."""
-        silent = (float(time_ns.min() - self.span_ns[0]) / NS_PER_S, float(self.span_ns[1] - time_ns.max()) / NS_PER_S)
-        return [s if s > _unseen_s(period_s) else 0.0 for s in silent]
+        silent_ns = (time_ns.min() - self.span_ns[0], _until_ns(self.span_ns, stream) - time_ns.max())
+        unseen_s = _unseen_s(stream["identity"]["period_s"], time_ns)
+        return [s if s > unseen_s else 0.0 for s in (float(ns) / NS_PER_S for ns in silent_ns)]
 
     def _recording(self, stream: Mapping[str, Any], key: ContactKey, residual_n: float | None) -> dict[str, Any]:
         """Settings of the recording, as JSON."""

@@ -49,7 +49,7 @@ def prove_rewards(
         try:
             hash(rewards[name])
         except TypeError as error:
-            needs = "must have a hash, by which it is checked once; write @dataclass(frozen=True), or a function"
+            needs = "must have a hash, by which it is checked once; write @dataclass(eq=False), or a function"
             raise RewardError(f"reward {name!r}: {error}, {needs}") from error
         _prove(name, rewards[name], sensors, attributes, length)
 
@@ -101,14 +101,15 @@ def _require_pure(name: str, reward: Reward | GroupReward, answers: Parsed, targ
         sensors, attributes = one.perceive.shape
         raise RewardError(
             f"reward {name!r}: {outside.splitlines()[0].split(': ', 1)[-1].rstrip('. ')}: must lie inside, or a step "
-            f"reads another element; there are {sensors} sensors and {attributes} attributes"
+            f"reads another element; bound it by jnp.clip: there are {sensors} sensors and {attributes} attributes"
         )
 
 
 def _written(value: Callable[..., Array], *of: Any) -> tuple[str, list[bytes]]:
     """The operations and numbers of a function, traced anew, without addresses in memory."""
     program = jax.make_jaxpr(lambda *of: value(*of))(*of)
-    return re.sub(r"0x[0-9a-f]+", "", str(program.jaxpr)), [np.asarray(x).tobytes() for x in program.consts]
+    plain = lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+    return re.sub(r"0x[0-9a-f]+", "", str(program.jaxpr)), [np.asarray(plain(x)).tobytes() for x in program.consts]
 
 
 def _changed_after(segment: str, answers: Parsed) -> Parsed:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from sensors_io.devices.base import Identity
 from sensors_io.devices.errors import DeviceLostError
 from sensors_io.force import ForceError, GravityModel
 from sensors_io.recording.book import ATTEMPTS, ObjectView
@@ -188,6 +189,38 @@ def test_a_contact_of_which_a_camera_saw_too_little_is_asked_for_again(tmp_path,
     hand = Hand()
     report = record_session(tmp_path, config, [Camera(hand), Blinking(hand, "digit")], Scale(hand), show=hand.show)
     assert (report.contacts, report.incomplete) == (1 + again, again)
+
+
+class Slow(Camera):
+    """Two frames a second, of a camera whose driver does not tell its rate."""
+
+    identity = property(lambda self: Identity(sensor=self.sensor))
+
+    def drain(self):
+        return [s for s in super().drain() if s.index % 50 == 0]
+
+
+class Dark(Slow):
+    """As many of a camera that promises a hundred, and exposes for half a second in the dark."""
+
+    identity = Camera.identity
+
+
+class Late(Camera):
+    """A camera whose program gives, and stamps, frames half a second after they were taken."""
+
+    def drain(self):
+        return [dataclasses.replace(s, index=s.index - 50) for s in super().drain() if s.index > 50]
+
+
+@pytest.mark.parametrize(("second", "late_s"), [(Slow, 0.0), (Dark, 0.0), (Late, 0.5)])
+def test_a_healthy_sensor_that_is_slow_or_late_completes_its_contacts(tmp_path, second, late_s):
+    """The last half second of the late one comes when the contact is over."""
+    coach = dataclasses.replace(CONFIG.coach, clear_s=2.0)
+    stages = (ContactStage(motion="slide_x", force_n=2.0), ContactStage(motion="tap", force_n=10.0, level=2))
+    hand, config = Hand(), dataclasses.replace(CONFIG, stages=stages, late_s={"digit": late_s}, coach=coach)
+    report = record_session(tmp_path, config, [Camera(hand), second(hand, "digit")], Scale(hand), show=hand.show)
+    assert (report.contacts, report.incomplete, +report.silent) == (2, 0, {})
 
 
 def test_the_gel_at_rest_and_the_object_are_kept(tmp_path):

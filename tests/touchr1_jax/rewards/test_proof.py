@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import random
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -100,7 +101,7 @@ def test_a_reward_that_is_not_pure_is_named(reward):
 )
 def test_an_index_beyond_the_end_is_named(reward, wrong):
     """JAX would read the last element."""
-    with pytest.raises(RewardError, match=f"reward 'mine': {wrong}: must lie inside"):
+    with pytest.raises(RewardError, match=f"reward 'mine': {wrong}: must lie inside.*bound it by jnp.clip"):
         prove_rewards({"mine": reward}, ["mine"], 2, A)
 
 
@@ -111,6 +112,13 @@ def test_levels_may_be_looked_up():
         "many": GroupReward(lambda tokens, p, t: table[0, p.conclude[:, 0]]),
     }
     prove_rewards(rewards, rewards, S, A)
+
+
+@pytest.mark.long
+def test_random_numbers_of_a_fixed_key_are_pure():
+    """The key is a constant of the program, of a type that NumPy does not have."""
+    drawn = Reward(lambda p, t: jax.random.uniform(jax.random.fold_in(jax.random.key(0), p.length)))
+    prove_rewards({"mine": drawn}, ["mine"], S, A)
 
 
 @pytest.mark.long
@@ -138,6 +146,18 @@ class Brevity:
         return 1.0 - parsed.length / self.longest
 
 
-def test_a_reward_without_a_hash_is_named():
-    with pytest.raises(RewardError, match="reward 'mine': unhashable type: 'Brevity', must have a hash"):
-        prove_rewards({"mine": Reward(Brevity())}, ["mine"], S, A)
+@dataclasses.dataclass(frozen=True)
+class Prices:
+    """A reward with an array, which has no hash either."""
+
+    of: np.ndarray
+
+    def __call__(self, parsed, target):
+        return jnp.asarray(self.of)[0] * parsed.formatted
+
+
+@pytest.mark.parametrize(("reward", "has_none"), [(Brevity(), "Brevity"), (Prices(np.ones(1)), "numpy.ndarray")])
+def test_a_reward_without_a_hash_is_named(reward, has_none):
+    said = rf"reward 'mine': unhashable type: '{has_none}', must have a hash.*write @dataclass\(eq=False\)"
+    with pytest.raises(RewardError, match=said):
+        prove_rewards({"mine": Reward(reward)}, ["mine"], S, A)
