@@ -16,6 +16,7 @@ from experiments.encoder.pretrain import StageOneDataConfig, open_touch
 from experiments.study import sources
 from experiments.study.sources import SourceConfig, odd_contacts, prepare_records
 from experiments.study.training import open_data, require_encoder
+from sensors_io.cards import replace_cards
 from sensors_io.commands.label import Label
 from sensors_io.importers.physiclear import PhysiclearConfig
 from sensors_io.locks import RecordsBusyError
@@ -165,3 +166,16 @@ def test_records_of_a_sensor_that_answers_cannot_name_are_refused(tmp_path, cont
     config = dataclasses.replace(tiny.STUDY, data="records", data_dir=tmp_path / "digit")
     with pytest.raises(DataError, match="digit holds records of digit: answers name gelsight_mini, xense"):
         open_data(config, 32, context)
+
+
+@pytest.mark.parametrize("split", ["train", "val", "test"])
+def test_a_part_without_labels_is_refused_before_training(tmp_path, records, context, split):
+    """Before, a run trained to its end and then found nothing to ask about its test contacts."""
+    shutil.copytree(records, tmp_path / "copy")
+    cards = RecordStore(records).objects.values()
+    bare = [dataclasses.replace(card, labels={}) if card.split == split else card for card in cards]
+    replace_cards(tmp_path / "copy", bare)
+    config = dataclasses.replace(tiny.STUDY, data="records", data_dir=tmp_path / "copy")
+    part = "sft" if split == "train" else split
+    with pytest.raises(DataError, match=f"part '{part}' of .*copy holds no object with a label: every part needs one"):
+        open_data(config, 16, context)
