@@ -41,6 +41,7 @@ class Dataset:
     visual_lies: np.ndarray  # bool [contact], the appearance contradicts the touch
     has_force: bool
     threads: int = 1
+    content: str = ""  # hash of all that was recorded; of scenes none, as their configuration decides it
     statistics: dict[int, TouchBatch] = dataclasses.field(default_factory=dict)
     computing: threading.Lock = dataclasses.field(default_factory=threading.Lock)
     """Of the thread that computes the statistics, for which all others wait."""
@@ -82,10 +83,12 @@ class Dataset:
         return rows
 
     def digest(self) -> str:
-        """First 16 hex digits of a SHA-256 of what is learned and scored: contacts, labels, and the split."""
+        """First 16 hex digits of a SHA-256 of what is learned and scored: contacts, recordings, labels, the split."""
         parts = [rows.tolist() for rows in (self.training, self.parts["val"], self.parts["test"])]
         keys = [str(key) for key in self.store.contacts]
-        content = json.dumps([keys, self.label.tolist(), self.visual_lies.tolist(), parts])
+        content = json.dumps(
+            [keys, self.label.tolist(), self.visual_lies.tolist(), parts, *filter(None, [self.content])]
+        )
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
     def summary(self) -> dict[str, Any]:
@@ -104,10 +107,12 @@ class Dataset:
 
 
 def require_same_records(data: Dataset, context: Context) -> None:
-    """`ConfigurationError` if contacts, labels or splits changed since the run began."""
+    """`ConfigurationError` if contacts, recordings, labels or splits changed since the run began."""
     path = str(data.store.path)
     where = hashlib.sha256(path.encode()).hexdigest()[:16]  # a run may read several
-    context.require_same(f"records/{where}", data.digest(), f"contacts, labels or splits of {path}, the records,")
+    context.require_same(
+        f"records/{where}", data.digest(), f"contacts, recordings, labels or splits of {path}, the records,"
+    )
 
 
 def split_parts(store: RecordStore, grpo_share: float | None, left_out: Sequence[int] = ()) -> dict[str, np.ndarray]:
@@ -145,10 +150,11 @@ def open_dataset(
     memory_gib: float = 0.0,
     threads: int = 1,
     left_out: Sequence[int] = (),
+    content: str = "",
 ) -> Dataset:
     """Open records and split them without the contacts that are left out.
 
-    `memory_gib` of their clips stay in memory once so many threads have read them.
+    `memory_gib` of their clips stay in memory once so many threads have read them; `content` as of `Dataset`.
     """
     store = RecordStore(path)
     clip = dataclasses.replace(clip, sensors=store.meta.sensors)
@@ -163,4 +169,5 @@ def open_dataset(
         visual_lies=np.array([bool(card.visual_lies) for card in cards]),
         has_force=any(sequence.force_n is not None for sequence in store.contact(0).values()),
         threads=threads,
+        content=content,
     )

@@ -127,7 +127,7 @@ class StudySeed:
                 whole = untrained(policy, data, self.seed) | dict(start)
                 return train_encoder(policy, whole, feed, config, hooks, seed=self.seed)
 
-        values = {"records": data.store.digest, "encoders": config, "clip": data.clip}
+        values = {"records": [data.store.digest, data.digest()], "encoders": config, "clip": data.clip}
         return self._shared("sft", stage, train, values, {"rows": rows, "start": start})
 
     def run_sft(self, config: StudySFT, stage: str, start: Mapping[str, Any] = {}, *, blind: bool = False) -> Params:
@@ -147,7 +147,7 @@ class StudySeed:
             with stage_hooks(self.context, stage, config.steps, scored=judge is not None) as hooks:
                 return train_sft(policy, params, feed, config, hooks, seed=self.seed, blind=blind, held_out=judge)
 
-        values = {"records": data.store.digest, "config": config, "clip": data.clip, "blind": blind}
+        values = {"records": [data.store.digest, data.digest()], "config": config, "clip": data.clip, "blind": blind}
         judged = np.zeros(0) if judge is None else data.parts["val"]
         arrays = {"evidence": self.evidence, "rows": data.parts["sft"], "start": start, "validation": judged}
         return self._shared("sft", stage, train, values, arrays)

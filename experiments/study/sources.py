@@ -6,7 +6,7 @@ import hashlib
 import json
 import time
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
 from typing import Literal
 
@@ -24,7 +24,7 @@ from sensors_io.pipeline import ClipConfig
 from sensors_io.quality import oddities, recorded_digest
 from sensors_io.records import RecordStore
 from sensors_io.scenes.config import SceneConfig, config_hash
-from sensors_io.schema import Flag, Sequence
+from sensors_io.schema import FRAME_ARRAYS, Flag, Sequence
 
 Source = Literal["generated", "physiclear", "records"]
 
@@ -87,32 +87,37 @@ def open_source(
     `ConfigurationError` if they are others than the run began with.
     """
     path = prepare_records(config, context)
-    odd = odd_contacts(config, path, context, clip.rejected)
-    data = open_dataset(path, clip, grpo_share, memory_gib, threads, odd if config.drop_odd else ())
+    odd, content = survey_contacts(config, path, context, clip.rejected)
+    data = open_dataset(path, clip, grpo_share, memory_gib, threads, odd if config.drop_odd else (), content)
     require_same_records(data, context)
     for line in data.levels() if config.data != "generated" else ():
         context.print(line)
     return data
 
 
-def odd_contacts(
+def survey_contacts(
     config: SourceConfig, path: Path, context: Context, rejected: Collection[Flag] = ()
-) -> tuple[int, ...]:
-    """Contacts of recordings of which a sequence teaches nothing about touch, printed by reason; none of scenes.
+) -> tuple[tuple[int, ...], str]:
+    """Contacts of recordings that teach nothing about touch, printed by reason, and a hash of all that was recorded.
 
-    `rejected` are the flags of frames that no clip shows where a sequence has others.
+    Scenes have neither: their configuration decides what they hold.  `rejected` are the flags of frames that no clip
+    shows where a sequence has others.
     """
     if config.data == "generated":
-        return ()
-    store, reasons = RecordStore(path), dict[str, dict[int, str]]()
+        return (), ""
+    store, reasons, content = RecordStore(path), dict[str, dict[int, str]](), hashlib.sha256()
+    views = [card.view for card in store.objects.values()]
     alike, films = dict[str, dict[str, int]](), {sensor: Counter[str]() for sensor in store.meta.sensors}
     for i in context.each("looking for odd contacts", range(len(store))):
         for sensor, sequence in store.contact(i).items():
             films.setdefault(sensor, Counter())[_film(sequence)] += 1
             for reason in (odd := oddities(sequence, rejected=rejected)):
                 reasons.setdefault(reason, {})[i] = sequence.name
+            shown = recorded_digest(sequence)
             if not odd:  # else black pictures would be copies of each other
-                alike.setdefault(recorded_digest(sequence), {})[sequence.name] = i
+                alike.setdefault(shown, {})[sequence.name] = i
+            content.update(f"{sequence.name} {shown} {sequence.contact_region_px} {sequence.mm_per_px}".encode())
+            _add_arrays(content, [getattr(sequence, name) for name in FRAME_ARRAYS if name != "frames"])
     for same in (list(names.items()) for names in alike.values()):
         sources = {(store.contacts[i].object_id, name.rpartition("/")[2]) for name, i in same}
         copies = same if len(sources) > 1 else same[1:]  # of one object and sensor the first is no copy
@@ -132,7 +137,13 @@ def odd_contacts(
     for what, names in bare.items():
         if names:
             context.print(f"without any {what}: {len(names)} of {len(store.objects)} objects, such as {names[0]}")
-    return tuple(sorted({i for rows in reasons.values() for i in rows}))
+    _add_arrays(content, views)
+    return tuple(sorted({i for rows in reasons.values() for i in rows})), content.hexdigest()[:16]
+
+
+def _add_arrays(content: "hashlib._Hash", arrays: Iterable[np.ndarray | None]) -> None:
+    for x in arrays:
+        content.update(b"-" if x is None else f"{x.dtype.str} {x.shape} ".encode() + np.ascontiguousarray(x).tobytes())
 
 
 def _listed(words: list[str]) -> str:

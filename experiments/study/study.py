@@ -140,7 +140,12 @@ def run_study(
     if not context.launcher.here:
         order = tuple((name, seed) for name in (SFT, BLIND, CONTINUED, *arms) for seed in range(config.seeds))
         parts = [StudyPart(name=name, seed=seed, first=name in (SFT, BLIND)) for name, seed in order]
-        values = {"records": data.store.digest, "config": config, "arms": arms, "algorithms": algorithms}
+        values = {
+            "records": [data.store.digest, data.digest()],
+            "config": config,
+            "arms": arms,
+            "algorithms": algorithms,
+        }
         train_parts(functools.partial(train_part, config, arms, algorithms), parts, values, config.share, context)
     return train_study(config, data, policy, arms, context, algorithms, variants, tactile=tactile, share=config.share)
 

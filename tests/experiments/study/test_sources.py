@@ -14,7 +14,7 @@ from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError, DataError
 from experiments.encoder.pretrain import StageOneDataConfig, open_touch
 from experiments.study import sources
-from experiments.study.sources import SourceConfig, odd_contacts, prepare_records
+from experiments.study.sources import SourceConfig, prepare_records, survey_contacts
 from experiments.study.training import open_data, require_encoder
 from sensors_io.cards import replace_cards
 from sensors_io.commands.label import Label
@@ -141,7 +141,7 @@ def test_odd_contacts_of_recordings_are_listed_before_training_and_left_out_on_r
         writer.write_contact([dataclasses.replace(x, key=again) for x in store.contact(first).values()])
     count = len(store) + 1
     config = StageOneDataConfig(data="records", data_dir=tmp_path / "odd")
-    assert odd_contacts(config, tmp_path / "odd", context) == tuple(sorted((first, black, copy, count - 1)))
+    assert survey_contacts(config, tmp_path / "odd", context)[0] == tuple(sorted((first, black, copy, count - 1)))
     parts = open_touch(dataclasses.replace(config, drop_odd=True), 2, 16, context).parts
     assert set(np.concatenate(list(parts.values()))) == set(range(len(store))) - {first, black, copy}
     printed = context.console.file.getvalue()
@@ -154,7 +154,33 @@ def test_odd_contacts_of_recordings_are_listed_before_training_and_left_out_on_r
     for part, rows in (("training", train[2:-1]), ("test", store.contacts_of_split("test"))):
         levels = [store.objects[store.contacts[i].object_id].labels["hardness"] for i in rows]
         assert f"{part} {levels.count(0)}, {levels.count(1)}, {levels.count(2)}" in hardness
-    assert odd_contacts(GENERATED, store.path, context) == ()
+    assert survey_contacts(GENERATED, store.path, context) == ((), "")
+
+
+def test_recordings_that_differ_in_a_time_or_a_view_are_others(data, tmp_path, context):
+    """The root of their index is the same: a trained encoder would be taken from the cache for the others too."""
+    store = data.store
+
+    def content_of(name, sequence=lambda x: x, card=lambda x: x):
+        with RecordWriter(tmp_path / name, meta=store.meta) as writer:
+            for each in store.objects.values():
+                writer.write_object(card(each))
+            for i in range(len(store)):
+                writer.write_contact([sequence(x) for x in store.contact(i).values()])
+        return survey_contacts(StageOneDataConfig(data="records", data_dir=tmp_path), tmp_path / name, context)[1]
+
+    later = lambda x: dataclasses.replace(x, host_time_ns=x.host_time_ns + (np.arange(len(x)) == len(x) - 1))
+    darker = lambda x: dataclasses.replace(x, view=x.view // 2)
+    same, again, *others = (
+        content_of("one"),
+        content_of("two"),
+        content_of("three", later),
+        content_of("4", card=darker),
+    )
+    assert same == again
+    assert len({same, *others}) == 3
+    one, two = (dataclasses.replace(data, content=content) for content in (same, others[0]))
+    assert one.digest() != two.digest()
 
 
 def test_records_of_a_sensor_that_answers_cannot_name_are_refused(tmp_path, context):
