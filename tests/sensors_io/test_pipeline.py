@@ -230,6 +230,7 @@ class TestClipBatches:
             first.close()
             second.close()
 
+    @pytest.mark.long
     @pytest.mark.parametrize("augment", [None, LIVELY], ids=["plain", "changed"])
     def test_machines_that_share_batches_read_them_together(self, store, augment):
         """Random changes too are those of the whole batch; other machines go on from the state of one."""

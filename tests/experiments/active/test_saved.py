@@ -64,6 +64,7 @@ def drawn():
     return explorer(0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("damage", ["byte", "config", "gone", "another"])
 def test_an_unfinished_run_publishes_a_damaged_policy_again(drawn, tmp_path, damage):
     """Before, it ended with a policy that nothing could read, or with that of another seed, and did not say so."""

@@ -396,6 +396,7 @@ def test_the_readme_asks_the_policy_of_the_package(capsys):
     assert re.match(r"(soft|firm|hard) \(soft \d+%, firm \d+%, hard \d+%\); without touch ", capsys.readouterr().out)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", shipped())
 def test_policies_of_the_package_are_small_and_have_a_card(name):
     files = {path.name: path.stat().st_size for path in (SHIPPED / name).iterdir()}

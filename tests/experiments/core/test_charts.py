@@ -98,6 +98,7 @@ def test_dominated_choices_are_crossed():
     assert BEATEN not in texts(draw([line]))
 
 
+@pytest.mark.long
 def test_ticks_are_whole_where_numbers_are_and_do_not_overlap_on_a_narrow_axis():
     assert "0.5" not in texts(draw([Panel([Series(x=[0, 1, 2, 3], y=[0, 10, 20, 30])])]))
     assert "0.5" in texts(draw([Panel([Series(x=[0, 1.5, 3], y=[0, 10, 20])])]))

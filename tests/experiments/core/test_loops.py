@@ -60,6 +60,7 @@ def test_a_signal_ends_the_run_after_the_step_is_saved(whole, tmp_path, capsys, 
     assert not differences(digests(run_directory(whole)), digests(run_directory(tmp_path)))
 
 
+@pytest.mark.long
 def test_bad_updates_are_left_out_of_the_training_and_counted_in_the_log(tmp_path, capsys):
     assert run_counting(tmp_path, "--poison-from", "3", "--poison-to", "5") == 0
     assert "count/0: 2 updates were left out" in capsys.readouterr().out

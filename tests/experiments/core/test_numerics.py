@@ -112,6 +112,7 @@ def test_settings_that_no_experiment_runs_with_are_refused(tmp_path, capsys, nam
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.long
 def test_a_variable_that_jax_cannot_read_is_named():
     order, env = [sys.executable, "-m", "experiments", "ablation_ordinal"], os.environ | {"JAX_ENABLE_X64": "maybe"}
     done = subprocess.run(order, env=env, capture_output=True, text=True, check=False)

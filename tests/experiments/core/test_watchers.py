@@ -88,6 +88,7 @@ def test_the_page_shows_what_the_policy_answers(tmp_path, console):
     context.close()
 
 
+@pytest.mark.long
 def test_curves_take_their_share_of_the_time_and_pages_stay_fresh(tmp_path, console):
     """Every look at the clock takes a second, so that curves take one and pages follow after ten."""
     page, context = watched(tmp_path, console, itertools.count().__next__)

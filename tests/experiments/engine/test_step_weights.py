@@ -16,6 +16,8 @@ from touchr1_jax.models.lora import LoraConfig
 from touchr1_jax.models.released_policy import ReleasedModel
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 
+pytestmark = pytest.mark.long
+
 TACTILE = TactileViTConfig(sensors=0, width=16, num_layers=1, num_heads=2, stem_width=4)
 STEP = StepShape(
     tokens=4,
@@ -34,7 +36,6 @@ def test_what_is_frozen_is_bfloat16_and_what_is_trained_is_not(stage, towers):
     assert state.params["adapters"]["decoder"]["layers"]["q_proj"]["a"].shape == (35, 2048, 2)
 
 
-@pytest.mark.long
 def test_a_base_in_four_bits_has_three_tenths_of_the_bytes_of_bfloat16():
     size = lambda step: sum(
         x.size * x.dtype.itemsize for x in jax.tree.leaves(abstract_step(SHAPES["7B"], step, "SFT")[1][-1])

@@ -41,6 +41,7 @@ def test_the_file_that_names_the_devices_does_not_count(run):
     assert digests(whole) == digests(damaged)
 
 
+@pytest.mark.long
 def test_what_a_kill_left_of_an_old_checkpoint_does_not_count_and_damage_of_another_does(run):
     whole, killed = run("a"), run("b")
     stage = killed / "checkpoints" / "sft" / "0"

@@ -43,6 +43,7 @@ def test_all_is_met_where_nothing_differs():
     assert unmet() == set()
 
 
+@pytest.mark.long
 def test_every_fault_breaks_its_requirement():
     differs = dataclasses.replace(KILLED, differs=("run 0: metrics.jsonl",))
     assert unmet(killed=differs) == {"files that differ after them"}

@@ -35,6 +35,7 @@ def test_error_of_each_method(scene, solve, least, most):
     assert least < displacement_error(np.asarray(found)[None], true)[0] < most
 
 
+@pytest.mark.long
 def test_oracles_agree_where_they_are_installed(context):
     errors = contact_oracles.oracle_errors(1, 32, 0, context)
     assert {"float64 reference (half-space)", "float64 reference (layer)"} <= set(errors)

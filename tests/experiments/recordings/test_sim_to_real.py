@@ -25,6 +25,7 @@ def unchanged():
     return press_pictures(SCENES, 1)
 
 
+@pytest.mark.long
 def test_unchanged_presses_are_those_of_the_records(unchanged):
     stored = make_sequence(SCENES, 1, press_slot(SCENES, 1), 0, 0)
     assert np.array_equal(unchanged, stored.frames)

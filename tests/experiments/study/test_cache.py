@@ -172,6 +172,7 @@ def test_the_source_of_rewards_counts_for_grpo_alone_and_that_of_models_for_both
         assert digest() != before
 
 
+@pytest.mark.long
 def test_the_source_that_sft_is_built_on_counts():
     """No library file that counts imports one that does not."""
     for path in (*(ROOT / "touchr1_jax").rglob("*.py"), *(ROOT / "sensors_io").rglob("*.py")):

@@ -72,6 +72,7 @@ def test_hdf5_on_a_full_disk_ends_in_one_line(tmp_path, monkeypatch, capfd, room
     assert main(["import", "exported", str(out / "x.h5"), "--out", str(tmp_path / "back")]) == 0
 
 
+@pytest.mark.long
 def test_a_shard_that_finds_no_room_is_named(tmp_path, monkeypatch, capsys):
     """The writer of shards raises a bare RuntimeError."""
     from array_record.python.array_record_module import ArrayRecordWriter

@@ -327,6 +327,7 @@ def test_a_draft_is_of_all_files_and_a_force_that_pulls_is_refused(tmp_path, cap
     assert f"{-np.abs(FORCE[::2, 2]).max():.3g}" in capsys.readouterr().out  # the least Fz of the table
 
 
+@pytest.mark.long
 def test_contacts_of_one_object_without_numbers_are_numbered_in_linear_time(tmp_path):
     count = 1_000
     with h5py.File(tmp_path / "a.h5", "w") as file:

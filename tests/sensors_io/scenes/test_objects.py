@@ -73,6 +73,7 @@ def test_material_informs_but_does_not_decide(name: str) -> None:
     assert odds.min() > 0.005  # the ranges of all materials overlap
 
 
+@pytest.mark.long
 def test_frequencies_follow_the_odds(solids: list[objects.Solid]) -> None:
     for name, prop in ALL.items():
         levels = np.array([s.levels()[name] for s in solids])

@@ -79,6 +79,7 @@ def test_interval_of_the_improvement_agrees_with_a_plain_loop():
     assert (apart.low, apart.mean, apart.high) == (1.0, 1.0, 1.0)
 
 
+@pytest.mark.long
 def test_stratified_bootstrap_agrees_with_a_plain_loop():
     rng = np.random.default_rng(2)
     scores = rng.normal(size=(5, 3))

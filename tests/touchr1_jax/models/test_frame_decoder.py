@@ -8,6 +8,8 @@ import pytest
 from tests.touchr1_jax.drawn import draw_params
 from touchr1_jax.models.frame_decoder import FrameDecoder, FrameDecoderConfig, from_cells, to_cells
 
+pytestmark = pytest.mark.long
+
 CONFIG = FrameDecoderConfig(cell_px=2, width=4, num_layers=1)
 
 

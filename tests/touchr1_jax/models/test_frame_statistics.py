@@ -14,6 +14,8 @@ from touchr1_jax.models.frame_statistics import (
     view_statistics,
 )
 
+pytestmark = pytest.mark.long
+
 FRAMES = np.random.default_rng(0).integers(0, 256, (2, 3, 16, 24, 3), np.uint8)
 """Two streams of three frames of 16 × 24 px: six patches of 8 px."""
 
@@ -34,7 +36,6 @@ def by_hand(stream: np.ndarray, row: int, column: int, side: tuple[int, int]) ->
     return np.array([np.concatenate([*one, one[3] - found[0][3], one[4] - found[0][4]]) for one in found])
 
 
-@pytest.mark.long
 def test_statistics_equal_a_plain_computation():
     found = np.asarray(frame_statistics(jnp.asarray(FRAMES), 8))
     assert found.shape == (2, 3, 6, 21)
@@ -45,7 +46,6 @@ def test_statistics_equal_a_plain_computation():
     np.testing.assert_allclose(whole[0, :, 0], by_hand(FRAMES[0], 0, 0, (16, 24)), atol=2e-4)
 
 
-@pytest.mark.long
 def test_scaled_statistics_hold_the_patch_and_the_mean_patch():
     found = np.asarray(scaled_statistics(jnp.asarray(FRAMES), 8))
     assert found.shape[-1] == WIDTH

@@ -12,6 +12,8 @@ from touchr1_jax.models.lm import DecoderConfig
 from touchr1_jax.models.tactile_vit import TactileViTConfig
 from touchr1_jax.models.vision import VisionConfig
 
+pytestmark = pytest.mark.long
+
 RNG = np.random.default_rng(0)
 
 
@@ -83,7 +85,6 @@ def test_scores_depend_on_the_difference_of_positions_alone(shift, gap):
     np.testing.assert_allclose(score(30), score(30 + shift), atol=2e-4)
 
 
-@pytest.mark.long
 def test_attend_over_blocks_is_attention_over_their_union():
     """Oracle: one softmax over the concatenated keys, head by head; query head h reads key head h // 2."""
     t, kv, r, d, sizes = 3, 2, 2, 4, (5, 3)
@@ -106,7 +107,6 @@ def test_attend_survives_scores_that_overflow_exp():
     np.testing.assert_allclose(out, [[200.0]])
 
 
-@pytest.mark.long
 def test_masked_keys_have_weight_and_gradient_exactly_zero():
     q, k, v = normal(2, 1, 1, 4), normal(1, 3, 4), normal(1, 3, 4)
     mask = jnp.array([True, False, True])

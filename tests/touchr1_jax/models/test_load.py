@@ -14,6 +14,8 @@ from touchr1_jax.models.load import Load, load_checkpoint
 from touchr1_jax.models.qwen.pictures import PixelBudget
 from touchr1_jax.models.qwen.safetensors import read_header
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture
 def directory(tmp_path):
@@ -21,7 +23,6 @@ def directory(tmp_path):
     return tmp_path
 
 
-@pytest.mark.long
 def test_everything_of_a_directory_is_read(directory):
     found = load_checkpoint(directory, jnp.float32)
     assert found.config.decoder.vocab_size == found.tokenizer.vocab_size == 512
@@ -32,7 +33,6 @@ def test_everything_of_a_directory_is_read(directory):
     np.testing.assert_array_equal(found.params["decoder"]["embedding"]["embedding"], table)
 
 
-@pytest.mark.long
 def test_command_says_what_it_found(directory, capsys):
     assert Load(directory=directory).run() == 0
     said = capsys.readouterr().out

@@ -8,6 +8,8 @@ import pytest
 from tests.touchr1_jax.drawn import draw_params
 from touchr1_jax.models.predictor import LatentPredictor, PredictorConfig, layer_norm
 
+pytestmark = pytest.mark.long
+
 P, S, T, N, D = 1, 2, 3, 2, 4
 CONFIG = PredictorConfig(width=8, num_layers=1, num_heads=2)
 
@@ -59,7 +61,6 @@ def test_it_is_told_when_and_how_hard(predict, inputs):
     assert changed(before, predict(latent, shown, index, force.at[:, :, 2].add(4)))[:, 2].all()
 
 
-@pytest.mark.long
 def test_a_fresh_predictor_copies_what_is_shown(inputs):
     latent, shown, *rest = inputs
     module = LatentPredictor(CONFIG, S)
@@ -69,6 +70,5 @@ def test_a_fresh_predictor_copies_what_is_shown(inputs):
     np.testing.assert_array_equal(out[:, 1], 0)
 
 
-@pytest.mark.long
 def test_layer_norm_by_hand():
     np.testing.assert_allclose(layer_norm(jnp.array([1.0, 3.0])), [-1, 1], rtol=1e-5)

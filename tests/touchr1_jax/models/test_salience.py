@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 from tests.touchr1_jax import tiny
 from touchr1_jax.models.salience import busiest_patches, fewer_frames, patch_change, rest_mean, salient_frames
 
+pytestmark = pytest.mark.long
+
 
 def test_change_is_told_by_patch():
     """Patch (row 1, column 2) of 8 px brightens by 10 in frame 1: nothing else changes."""
@@ -43,7 +45,6 @@ def test_the_rest_becomes_its_mean():
     np.testing.assert_allclose(batched[1], [[0, -1], [-4, -5]], rtol=1e-6)
 
 
-@pytest.mark.long
 @settings(max_examples=15, deadline=None)
 @given(st.lists(st.floats(0, 9), min_size=6, max_size=6), st.integers(3, 6), st.integers(1, 3))
 def test_chosen_frames_lie_nearest_to_the_levels(change, exist, count):
@@ -70,7 +71,6 @@ def test_impossible_choices_are_refused(frames, count):
         salient_frames(jnp.zeros(frames), jnp.ones(frames, bool), count)
 
 
-@pytest.mark.long
 def test_a_batch_loses_its_dull_frames_together_with_all_that_is_said_of_them():
     batch = jax.tree.map(jnp.asarray, tiny.touch_batch(0))
     frames = np.zeros(batch.frames.shape, np.uint8)

@@ -14,6 +14,8 @@ from touchr1_jax.models.layers import mrope
 from touchr1_jax.models.lm import DecoderConfig, DecoderLayer, Rematerialised
 from touchr1_jax.models.vmappable_dense import Dense, Embed, linear, linear_p, product_with_weights
 
+pytestmark = pytest.mark.long
+
 DECODER = DecoderConfig(vocab_size=16)
 RNG = np.random.default_rng(0)
 X, W = (jnp.asarray(RNG.normal(size=shape), jnp.float32) for shape in ((2, 3, 5, 4), (4, 6)))
@@ -54,7 +56,6 @@ def test_weights_may_be_batched_too():
     np.testing.assert_allclose(pairs, jax.vmap(jnp.matmul, in_axes=(1, 0))(X, many), rtol=1e-6)
 
 
-@pytest.mark.long
 def test_tangents_and_second_derivatives():
     ours, theirs = (jax.hessian(lambda w, p=p: value(p, w, X[0, 0]))(W) for p in (linear, jnp.matmul))
     np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-5)
@@ -75,7 +76,6 @@ def products(jaxpr) -> int:
     return sum(eqn.primitive is linear_p for eqn in jaxpr.eqns) + sum(map(products, inner))
 
 
-@pytest.mark.long
 def test_rematerialised_layers_multiply_with_no_weight_twice():
     """The backward pass keeps what they make of weights; of a policy that keeps nothing the count is larger."""
     x, mask = jnp.ones((5, DECODER.hidden_size)), jnp.ones(5, bool)
@@ -119,7 +119,6 @@ def test_the_dense_layer_is_flax_s():
     np.testing.assert_allclose(ours.apply(params, X), theirs.apply(params, X), rtol=1e-6)
 
 
-@pytest.mark.long
 def test_logits_of_the_table_are_flax_s():
     key, query = jax.random.key(0), X
     ours, theirs = Embed(9, 4), nn.Embed(9, 4)

@@ -149,6 +149,7 @@ def test_settings_of_the_sampler_never_change():
         dataclasses.replace(CONFIG, greedy=False, temperature=0.0)
 
 
+@pytest.mark.long
 def test_tokens_of_a_rollout_are_independent_draws():
     """One key for all steps would repeat the first token."""
     said = jax.jit(lambda k: random_text(k, 200, 6))(jax.random.key(0))

@@ -63,6 +63,7 @@ def test_log_probabilities_are_those_of_the_free_policy():
     np.testing.assert_allclose(said.log_prob, np.where(said.mask, free, 0), rtol=1e-5)
 
 
+@pytest.mark.long
 def test_tags_of_another_language_need_no_code():
     language = dataclasses.replace(tiny.LANGUAGE, tags=("feel", "weigh", "say"))
     constraint = compile_constraint(language, character_level())

@@ -14,6 +14,8 @@ from touchr1_jax.training.latent_probes import (
 )
 from touchr1_jax.training.linear_probe import ProbeConfig
 
+pytestmark = pytest.mark.long
+
 
 def test_features_are_means_over_the_steps_that_exist():
     latent = np.arange(1 * 2 * 3 * 1 * 2, dtype=np.float32).reshape(1, 2, 3, 1, 2)
@@ -21,7 +23,6 @@ def test_features_are_means_over_the_steps_that_exist():
     np.testing.assert_array_equal(contact_features(latent, exists), [[1, 2, 0, 0]])
 
 
-@pytest.mark.long
 def test_a_probe_reads_what_is_there_and_cannot_read_what_is_not():
     rng = np.random.default_rng(0)
     label = np.stack([rng.integers(0, 3, 240), rng.integers(0, 3, 240)], 1)
@@ -35,7 +36,6 @@ def test_a_probe_reads_what_is_there_and_cannot_read_what_is_not():
     assert right[:, 1].mean() < 0.6
 
 
-@pytest.mark.long
 def test_rank_of_known_shapes():
     rng = np.random.default_rng(0)
     line = np.outer(np.linspace(-1, 1, 50), rng.normal(size=6)).astype(np.float32)

@@ -19,6 +19,8 @@ from touchr1_jax.training.objectives import (
     random_patches,
 )
 
+pytestmark = pytest.mark.long
+
 P, S = 4, tiny.S
 
 
@@ -31,7 +33,6 @@ def test_contrast_by_hand():
     np.testing.assert_allclose(contrast_loss(same, everything, 0.5), np.log(2), rtol=1e-5)
 
 
-@pytest.mark.long
 def test_contrast_leaves_out_what_was_not_recorded():
     embedding = jnp.asarray(np.random.default_rng(0).normal(size=(3, 2, 4)), jnp.float32)
     exists = jnp.array([[True, True], [True, True], [True, False]])
@@ -102,7 +103,6 @@ def contacts() -> MeasuredTouch:
     return jax.tree.map(jnp.asarray, MeasuredTouch(touch=touch, depth_mm=depth))
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("objective", ["contrast", "masked", "physics"])
 def test_each_objective_is_learned(contacts, objective):
     config = DynamicsConfig(encoder=ENCODER, objective=objective)

@@ -20,6 +20,8 @@ from touchr1_jax.models.qwen.names import published
 from touchr1_jax.models.qwen.safetensors import read_header, write_file
 from touchr1_jax.models.qwen.weights import load_params, save_params, save_tensors
 
+pytestmark = pytest.mark.long
+
 CASE = CASES["text_untied"]
 CONFIG = tiny.config_of(CASE)
 
@@ -78,7 +80,6 @@ def test_initial_parameters_have_the_abstract_shapes():
     assert jax.tree.map(shape, fresh) == jax.tree.map(shape, abstract_params(CONFIG))
 
 
-@pytest.mark.long
 def test_kernels_lie_with_inputs_first(expected, weights):
     """Published as [out, in], and the patch embedding as a convolution."""
     first, last = (expected["decoder"][name]["mlp"]["down"]["kernel"] for name in ("layers", "last_layer"))
@@ -89,7 +90,6 @@ def test_kernels_lie_with_inputs_first(expected, weights):
     np.testing.assert_array_equal(expected["decoder"]["head"]["kernel"], weights["lm_head.weight"].T)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("rename", [dict, new_names])
 @pytest.mark.parametrize("sharded", [False, True])
 def test_every_layout_gives_the_same_parameters(tmp_path, weights, expected, rename, sharded):
@@ -100,13 +100,11 @@ def test_every_layout_gives_the_same_parameters(tmp_path, weights, expected, ren
     assert_equal(load_params(tmp_path, CONFIG, jnp.float32), expected)
 
 
-@pytest.mark.long
 def test_kernels_are_encoded_as_they_are_read(tmp_path, weights, expected):
     write_file(tmp_path / "model.safetensors", weights)
     assert_equal(load_params(tmp_path, CONFIG, jnp.float32, four_bits=True), quantised(expected))
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("stored", "wanted"), [(np.float32, jnp.bfloat16), (np.float16, jnp.float32), (jnp.bfloat16, jnp.float32)]
 )
@@ -118,7 +116,6 @@ def test_tensors_are_cast(tmp_path, weights, stored, wanted):
     np.testing.assert_array_equal(loaded["decoder"]["norm"]["scale"], theirs)
 
 
-@pytest.mark.long
 def test_parameters_are_saved_as_published(tmp_path, weights, expected):
     save_params(tmp_path, expected, CONFIG)
     assert_equal(load_params(tmp_path, CONFIG, jnp.float32), expected)
@@ -127,7 +124,6 @@ def test_parameters_are_saved_as_published(tmp_path, weights, expected):
     assert len(sizes) == 1
 
 
-@pytest.mark.long
 def test_a_checkpoint_is_written_in_shards_one_tensor_at_a_time(tmp_path, weights, expected):
     seen, made = [], []
 
@@ -183,7 +179,6 @@ def test_tied_head_beside_an_untied_config_is_missing(tmp_path, weights):
     assert "missing: lm_head.weight (96, 64)" in misfit(tmp_path, weights)
 
 
-@pytest.mark.long
 def test_a_tied_checkpoint_may_store_its_head(tmp_path, weights):
     """As some libraries write it, and only where it is the embedding."""
     tied, table = tiny.config_of(CASES["text"]), weights["model.embed_tokens.weight"]
@@ -269,7 +264,6 @@ def test_index_must_be_one(tmp_path, content):
         load_params(tmp_path, CONFIG)
 
 
-@pytest.mark.long
 def test_loaded_parameters_lie_where_they_are_asked_to(tmp_path, weights, expected):
     write_file(tmp_path / "model.safetensors", weights)
     mesh = MeshConfig().build(jax.devices()[:1])
