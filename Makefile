@@ -32,7 +32,7 @@ experiment: setup  ## run an experiment: EXP=name, ARGS="--scale smoke ..."
 demo: setup  ## ask a trained policy in the browser: ARGS="POLICY", that of the package by default
 	$(BIN)/python -m experiments demo $(ARGS)
 
-test: setup  ## pass the tests (five to seven minutes on two cores)
+test: setup  ## pass the tests (five minutes on two cores)
 	$(PYTEST) -m 'not long and not slow' $(ARGS)
 
 test-long: setup  ## pass the tests that train or compile for seconds (half an hour)
