@@ -116,10 +116,11 @@ def _sees_all(until_ns: int, entries: Seq[JournalEntry], frames: Seq[JournalEntr
     phases = [(e.plain["time_ns"], e.plain["phase"]) for e in entries if e.kind == "phase"]
     touched = list(itertools.dropwhile(lambda begun: begun[1] == Phase.APPROACH, phases))
     times = np.sort([e.plain["time_ns"] for e in frames])
+    unseen_ns = _unseen_s(stream["identity"]["period_s"], times) * NS_PER_S
     begun_ns = [min(time_ns, until_ns) for time_ns, _ in touched]
     for since_ns, to_ns in itertools.pairwise([*begun_ns, until_ns]):
         edges = np.array([min(since_ns, times[0]), *times, max(to_ns, times[-1])])
-        gone = np.diff(edges) > _unseen_s(stream["identity"]["period_s"], times) * NS_PER_S
+        gone = np.diff(edges) > unseen_ns
         within_ns = np.minimum(edges[1:], to_ns) - np.maximum(edges[:-1], since_ns)
         if np.any(gone & (within_ns > (to_ns - since_ns) / 2)):
             return False
