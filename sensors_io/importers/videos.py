@@ -196,8 +196,8 @@ def _cards(row_of: Mapping[str, LabelRow], objects: Mapping[str, str], config: V
                 "each; correct one of the lines"
             )
         cards.setdefault(name, card)
-    told = {objects[clip] for clip, row in row_of.items() if row.cells.get(SPLIT)}
-    new = [name for name, card in cards.items() if card.labels and name not in told]
+    given = {objects[clip] for clip, row in row_of.items() if row.cells.get(SPLIT)}
+    new = [name for name, card in cards.items() if card.labels and name not in given]
     least = 1 / len(new) if len(new) > 2 else 0.0
     shares = {share: max(x, least) if (x := getattr(config, share)) else 0.0 for share in ("val_share", "test_share")}
     splits = split_by_name(new, **shares)

@@ -124,8 +124,8 @@ class RolloutServer:
             raise ValueError(f"mesh is {devices.shape}: must be one device {needs}; leave it, or rollouts.url, out")
         answer = self._send(MODELS)
         if not isinstance(answer, dict) or not isinstance(answer.get("data"), list):
-            told = str(answer)[:100]
-            raise RolloutError(f"{self._url}{MODELS} answers {told}: must be a list of models; correct rollouts.url")
+            shown = str(answer)[:100]
+            raise RolloutError(f"{self._url}{MODELS} answers {shown}: must be a list of models; correct rollouts.url")
 
     def before(
         self, step: Step, policy: ReleasedPolicy, table: Float[Array, "V D"], config: GRPOConfig, devices: SingleDevice

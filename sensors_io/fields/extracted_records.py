@@ -1,4 +1,4 @@
-"""Fields beside the pictures of records: new records with both, a unit for each shard, resumed where it stopped."""
+"""Fields extracted from the pictures of records: new records with both, written in units of a shard and resumable."""
 
 import dataclasses
 import functools
@@ -62,7 +62,7 @@ class FieldsJob:
         return hashlib.sha256(text.encode() + background).hexdigest()[:16]
 
 
-def fields_beside(
+def write_extracted(
     job: FieldsJob,
     out: pathlib.Path,
     *,
@@ -70,7 +70,7 @@ def fields_beside(
     frames_per_shard: int = FRAMES_PER_SHARD,
     launcher: Launcher = HERE,
 ) -> tuple[Skip, ...]:
-    """Write records with the fields beside the pictures in `out`; contacts that are there already are kept.
+    """Write records with pictures and extracted fields into `out`; contacts that are there already are kept.
 
     A contact that cannot be read, such as one without a gel at rest, is left out and returned with the reason.
 
