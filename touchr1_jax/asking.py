@@ -69,8 +69,8 @@ class TouchAnswer:
 
     def __str__(self) -> str:
         shares = ", ".join(f"{word} {p:.0%}" for word, p in self.probabilities.items())
-        said = f"{self.word or 'no readable answer'} ({shares})"
-        return said if self.untouched is None else f"{said}; without touch {self.untouched}"
+        answer = f"{self.word or 'no readable answer'} ({shares})"
+        return answer if self.untouched is None else f"{answer}; without touch {self.untouched}"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -57,8 +57,8 @@ class FieldsJob:
         """First 16 hex digits of the SHA-256 of the job and of the digest of its records and their gels at rest."""
         background = b"" if self.gel.background is None else self.gel.background.tobytes()
         made_by = "" if self.calibration is None else self.calibration.hash
-        said = [digest, self.sensor, made_by, self.gel.rest_frames, self.gel.mm_per_px, self.rows]
-        text = json.dumps([*said, dataclasses.asdict(self.config)], default=str)
+        parts = [digest, self.sensor, made_by, self.gel.rest_frames, self.gel.mm_per_px, self.rows]
+        text = json.dumps([*parts, dataclasses.asdict(self.config)], default=str)
         return hashlib.sha256(text.encode() + background).hexdigest()[:16]
 
 

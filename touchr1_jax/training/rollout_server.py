@@ -211,7 +211,7 @@ class RolloutServer:
                     content = answer.read()
                 return json.loads(content) if path in (MODELS, COMPLETE) else None
             except urllib.error.HTTPError as error:
-                problem = f"status {error.code} ({_said(error)})"
+                problem = f"status {error.code} ({_message(error)})"
                 if path == LOAD and attempt and "already" in problem:
                     return None  # the first answer was lost
                 if error.code < 500 and error.code not in TRANSIENT:
@@ -224,7 +224,7 @@ class RolloutServer:
         )
 
 
-def _said(error: urllib.error.HTTPError) -> str:
+def _message(error: urllib.error.HTTPError) -> str:
     """Beginning of the text of a refusal."""
     try:
         return error.read(300).decode("utf-8", errors="replace").strip()
