@@ -54,7 +54,7 @@ class FieldsJob:
             )
 
     def hash(self, digest: str) -> str:
-        """First 16 hex digits of the SHA-256 of the job and of the digest of its records and their gels at rest."""
+        """First 16 hex digits of the SHA-256 of the job and of a digest of its records and their gels at rest."""
         background = b"" if self.gel.background is None else self.gel.background.tobytes()
         made_by = "" if self.calibration is None else self.calibration.hash
         parts = [digest, self.sensor, made_by, self.gel.rest_frames, self.gel.mm_per_px, self.rows]
@@ -93,11 +93,13 @@ def write_extracted(
         )
     contacts, skipped = _readable_contacts(store, job)
     rests = rest_pictures(store.path)
+    content = [f"{name} {zlib.crc32(x)}" for name, x in rests.items()]
+    content += [f"{i} {store.checksum(i)}" for i in contacts]  # the index knows sizes alone
     fields = {"of": job.sensor, "records": store.digest, "rows": job.rows}
     meta = RecordsMeta(
         source=store.meta.source,
         licence=store.meta.licence,
-        config_hash=job.hash(" ".join([store.digest, *(f"{name} {zlib.crc32(x)}" for name, x in rests.items())])),
+        config_hash=job.hash(" ".join([store.digest, *content])),
         sensors=store.meta.sensors,
         notes={**store.meta.notes, "fields": fields | {"skipped": [dataclasses.asdict(skip) for skip in skipped]}},
     )

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import pathlib
+import shutil
 
 import cv2
 import numpy as np
@@ -126,6 +127,16 @@ def test_the_gel_at_rest_of_other_records_stays(tmp_path):
     put_rest_pictures(records, {"rest.png": b"another"})
     refused(RecordsExistError, "made by config", write_extracted, job(records), tmp_path / "out")
     assert rest_pictures(tmp_path / "out") == {"rest.png": b"a picture"}
+
+
+def test_an_extraction_of_other_recordings_is_not_continued(tmp_path):
+    """Under the same keys and in files of the same size, which is all that the index knows."""
+    records = written(tmp_path / "records", 1, force_n=np.full((3, 3), -1.5, np.float32))
+    before = RecordStore(records).digest
+    write_extracted(job(records), tmp_path / "out")
+    shutil.rmtree(records)
+    assert RecordStore(written(records, 1, force_n=np.full((3, 3), -2.5, np.float32))).digest == before
+    refused(RecordsExistError, "made by config", write_extracted, job(records), tmp_path / "out")
 
 
 def test_a_contact_without_a_gel_at_rest_costs_no_other(tmp_path):
