@@ -327,10 +327,8 @@ class RecordStore:
         Raises:
           CorruptRecordsError: an entry that cannot be read.
         """
-        found = 0
-        for entry in self.contacts.entries(i).values():
-            found = self._entries.decode(entry, lambda data, found=found: zlib.crc32(data, found))
-        return found
+        found = [self._entries.decode(entry, zlib.crc32) for entry in self.contacts.entries(i).values()]
+        return zlib.crc32(np.array(found, np.uint32).tobytes())
 
     def fetch_ahead(self, contacts: Iterable[int]) -> None:
         """Begin to copy the shards of contacts from a store, in the order in which these are read."""
