@@ -74,8 +74,8 @@ def _run(args: list[str]) -> int:
     if args[0] not in COMMANDS:
         close = difflib.get_close_matches(args[0], COMMANDS)
         asked = f" Did you mean {' or '.join(close)}?" if close else ""
-        told = [f"There is no command {args[0]!r}.{asked}", *usage()]
-        ERR.print("\n".join(told), markup=False, highlight=False, soft_wrap=True)
+        lines = [f"There is no command {args[0]!r}.{asked}", *usage()]
+        ERR.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
         return 2
     from sensors_io.commands.values import require_possible
 

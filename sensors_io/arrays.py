@@ -54,8 +54,8 @@ def load_arrays(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     except _BROKEN as error:
         if of_system(error):
             raise
-        told = str(error).partition("\n")[0][:200]  # NumPy's further lines say how to trust the file
-        raise ArraysError(f"{path} cannot be read as arrays ({told}); copy it again from its source") from error
+        reason = str(error).partition("\n")[0][:200]  # NumPy's further lines say how to trust the file
+        raise ArraysError(f"{path} cannot be read as arrays ({reason}); copy it again from its source") from error
 
 
 def _require_all(archive: zipfile.ZipFile, path: pathlib.Path) -> None:

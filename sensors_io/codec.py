@@ -205,7 +205,7 @@ def _wide(name: str, x: np.ndarray) -> bool:
 
 
 def _open(data: bytes, kind: str) -> tuple[dict[str, Any], memoryview]:
-    """Header and array bytes of an entry, after its checksum held."""
+    """Header and array bytes of an entry, after its checksum was verified."""
     if len(data) < _PREFIX.size or data[:4] not in (_MAGIC, _OLD_MAGIC):
         raise CorruptRecordsError(f"the entry starts with {data[:4]!r}, not with {_MAGIC!r} or {_OLD_MAGIC!r}")
     _, checksum, length = _PREFIX.unpack_from(data)

@@ -13,7 +13,7 @@ from sensors_io.schema import ObjectCard, SchemaError, Sequence
 from sensors_io.shards import Entries, ShardWriter
 
 RESTS = "backgrounds"
-"""Folder beside the shards with pictures of the gel at rest, which sequences name in `camera`."""
+"""Folder next to the shards with pictures of the gel at rest, which sequences name in `camera`."""
 
 _CARDS = 4096
 """Cards that stay in memory, with their views; where there are no more, they are read at once."""
@@ -120,19 +120,19 @@ def convert(root: pathlib.Path, index: Index) -> bool:
 
 
 def rest_pictures(root: Place) -> dict[str, bytes]:
-    """Files with the gel at rest that lie beside records, by name.
+    """Files with the gel at rest that are stored with records, by name.
 
     Raises:
       StoreError: a URL that cannot be read.
     """
     if isinstance(root, pathlib.Path):
         return {path.name: path.read_bytes() for path in sorted((root / RESTS).glob("*.png"))}
-    beside = Mirror(f"{root}/{RESTS}")
-    return {name: beside.fetch(name).read_bytes() for name in sorted(beside.files())}
+    mirror = Mirror(f"{root}/{RESTS}")
+    return {name: mirror.fetch(name).read_bytes() for name in sorted(mirror.files())}
 
 
 def put_rest_pictures(root: pathlib.Path, files: Mapping[str, bytes]) -> None:
-    """Write such files beside records."""
+    """Write such files into the folder of records."""
     for name, data in files.items():
         path = root / RESTS / name
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -4,8 +4,8 @@
 
 The first frame or row stays as it is; one after the other they make the fourth filter.  What is still except for noise
 wants "time", what was decoded from a lossy video or jumps from frame to frame wants "rows", and pure noise "none".
-Undoing a difference adds whole frames or rows at a time, which costs little beside the decompression; columns would
-have to be added pixel by pixel and are left out for it.
+Undoing a difference adds whole frames or rows at a time, which costs little compared with the decompression; columns
+would have to be added pixel by pixel and are left out for it.
 """
 
 from collections.abc import Mapping

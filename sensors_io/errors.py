@@ -22,7 +22,7 @@ def of_system(error: BaseException) -> bool:
     return isinstance(error, OSError) and error.errno in _OF_SYSTEM
 
 
-def told(error: BaseException) -> str:
+def name_and_text(error: BaseException) -> str:
     """Name and text of an error; its `repr` may hold the whole file that it could not decode."""
     return f"{type(error).__name__}: {error}"
 

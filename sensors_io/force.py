@@ -19,11 +19,11 @@ GRAVITY_M_PER_S2 = 9.80665
 _WORST_CONDITION = 100.0  # of the poses: errors of a reading grow by at most this
 _STEPS = 4  # of the grid on which lags are looked for, in one frame period
 _DEGREE = 3  # of the gel's response to force
-_LEAST_WEIGHT_N = 0.02  # 2 g: below it a centre of mass cannot be told
+_LEAST_WEIGHT_N = 0.02  # 2 g: below it a centre of mass cannot be determined
 
 
 class ForceError(UserError, ValueError):
-    """Readings from which nothing can be told; the message says what to do about it."""
+    """Readings from which nothing can be determined; the message says what to do about it."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -22,7 +22,7 @@ from typing import Any, Self, TypeVar
 import numpy as np
 
 from sensors_io.codec import CorruptRecordsError, RecordsError
-from sensors_io.errors import MALFORMED, of_system, told
+from sensors_io.errors import MALFORMED, name_and_text, of_system
 from sensors_io.json_files import seal, unseal
 from sensors_io.remote import Place, StoreError, local
 from sensors_io.schema import MOTIONS
@@ -135,7 +135,7 @@ class Index:
             if isinstance(error, RecordsError) or of_system(error):
                 raise
             raise CorruptRecordsError(
-                f"{root}/{INDEX} is damaged ({told(error)}); delete {root} and write it again"
+                f"{root}/{INDEX} is damaged ({name_and_text(error)}); delete {root} and write it again"
             ) from error
 
     @classmethod
@@ -258,7 +258,7 @@ def settled(root: Place, opened: Callable[[dict[str, Any], str], _T]) -> _T:
 
 
 def looks_like_records(path: pathlib.Path) -> bool:
-    """True of a folder with an index, or with what stands beside one that is lost: its pictures are no others."""
+    """True of a folder with an index, or with the files that accompany a lost one: its pictures are no others."""
     return any((path / name).exists() for name in (INDEX, JOURNALS)) or any(path.glob("*.arrayrecord"))
 
 
@@ -289,7 +289,9 @@ def read_root(root: Place) -> tuple[dict[str, Any], str]:
     except StoreError:
         raise
     except MALFORMED as error:
-        raise CorruptRecordsError(f"{path} is damaged ({told(error)}); delete {root} and write it again") from error
+        raise CorruptRecordsError(
+            f"{path} is damaged ({name_and_text(error)}); delete {root} and write it again"
+        ) from error
     raise RecordsVersionError(
         f"{path} is {found[0]!r} version {found[1]!r}, this code reads {FORMAT!r} versions {READABLE}; "
         "write the records again, or read them with the code that wrote them"

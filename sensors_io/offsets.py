@@ -5,7 +5,7 @@ import pathlib
 from collections.abc import Iterable, Mapping
 from typing import Self
 
-from sensors_io.errors import MALFORMED, UserError, told
+from sensors_io.errors import MALFORMED, UserError, name_and_text
 from sensors_io.json_files import read_json, write_json
 
 
@@ -20,7 +20,7 @@ class Offset:
     Args:
       late_s: positive where the same moment is stamped later.
       spread_s: standard deviation of one tap; `None` where it came from presses.
-      events: taps that both felt; 0 where it came from presses.
+      events: taps that both measured; 0 where it came from presses.
       by: "taps" or "presses".
       agreement: correlation of the rates of change, for presses; 1 for taps.
     """
@@ -78,7 +78,7 @@ class Offsets:
                 raise ValueError(f"late_s are {late_s}: must lie within ±{LARGEST_S} s")
             return cls(reference=str(tree["reference"]), sensors=sensors)
         except (OSError, *MALFORMED) as error:
-            raise OffsetsError(f"{path} holds no offsets ({told(error)}); make them with `sync`") from error
+            raise OffsetsError(f"{path} holds no offsets ({name_and_text(error)}); make them with `sync`") from error
 
 
 LARGEST_S = 2.0

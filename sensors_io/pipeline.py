@@ -74,16 +74,18 @@ class ClipMemory:
         """Bytes of the clips that stay."""
         return self._held
 
-    def get(self, i: int, make: Callable[[], dict[str, np.ndarray]], *, felt: bool = True) -> dict[str, np.ndarray]:
-        """The arrays of contact i, felt or not, from memory or made now; they must not be written to."""
-        kept = self._clips.get((i, felt))
+    def get(
+        self, i: int, make: Callable[[], dict[str, np.ndarray]], *, with_touch: bool = True
+    ) -> dict[str, np.ndarray]:
+        """The arrays of contact i, with touch or without, from memory or made now; they must not be written to."""
+        kept = self._clips.get((i, with_touch))
         if kept is not None:
             return kept
         arrays = make()
         size = sum(array.nbytes for array in arrays.values())
         with self._lock:
-            if (i, felt) not in self._clips and self._held + size <= self._most:
-                self._clips[i, felt] = arrays
+            if (i, with_touch) not in self._clips and self._held + size <= self._most:
+                self._clips[i, with_touch] = arrays
                 self._held += size
         return arrays
 
@@ -140,7 +142,7 @@ def make_clip(
     return _clip(key, card, config, stream_mask=np.array([s in contact for s in config.sensors]), **streams)
 
 
-def make_unfelt_clip(key: ContactKey, card: ObjectCard, config: ClipConfig) -> Clip:
+def make_clip_without_touch(key: ContactKey, card: ObjectCard, config: ClipConfig) -> Clip:
     """The same contact for a policy without touch: view and labels, no stream present, images of one pixel."""
     shape = (len(config.sensors), config.frames)
     return _clip(
@@ -166,7 +168,7 @@ def clip_batches(
     repeat: bool = True,
     drop_remainder: bool = False,
     own: Any = None,
-    felt: bool = True,
+    with_touch: bool = True,
     augment: AugmentConfig | None = None,
     memory: ClipMemory | None = None,
     workers: int = 0,
@@ -186,32 +188,32 @@ def clip_batches(
       repeat: False ends after one epoch.
       drop_remainder: whether the last, smaller batch of an unrepeated epoch is dropped.
       own: rows of each batch that are read, where machines share it; None for all.  States are those of the whole.
-      felt: False reads no touch, for policies that have none (`make_unfelt_clip`).
-      augment: random changes of what is felt, for training; a function of `seed` and of the clip's place in the order.
+      with_touch: False reads no touch, for policies that have none (`make_clip_without_touch`).
+      augment: random changes of the touch, for training; a function of `seed` and of the clip's place in the order.
       memory: where clips stay that are not changed at random; None for nowhere.
       workers: reading processes; 0 reads in threads of this one.  States carry over between equal numbers of workers.
       threads: reading threads of each process.
 
     Raises:
-      SchemaError: no contact, or one that the store does not hold; a memory for other clips or beside `workers`; rows
+      SchemaError: no contact, or one that the store does not hold; a memory for other clips or with `workers`; rows
         that a batch does not have.
     """
     rows = _checked_rows(indices, len(store))
     _bind_memory(memory, store, config, workers)
     dataset = grain.MapDataset.source(rows).seed(seed)
     dataset = dataset.shuffle() if shuffle else dataset
-    if felt and isinstance(store, RecordStore):
+    if with_touch and isinstance(store, RecordStore):
         store.fetch_ahead(dataset[i] for i in range(len(rows)))
     if repeat:
         dataset = dataset.repeat()
     # grain rounds the number of batches up in floating point, to 2⁶³ for the 2⁶³ − 1 rows of an endless data set: one
     # more than it can count to.  Without a remainder it divides whole numbers, and an endless data set never has one
     whole = drop_remainder or repeat
-    reader = _Reader(store, config, felt, augment or AugmentConfig())
-    if felt and reader.augment.active:
+    reader = _Reader(store, config, with_touch, augment or AugmentConfig())
+    if with_touch and reader.augment.active:
         clips = dataset.random_map(reader)
     elif memory is not None:
-        clips = dataset.map(lambda i: memory.get(i, lambda: reader(i), felt=felt))
+        clips = dataset.map(lambda i: memory.get(i, lambda: reader(i), with_touch=with_touch))
     else:
         clips = dataset.map(reader)
     return _read_ahead(_batched(clips, batch_size, own, whole), workers, threads)
@@ -294,17 +296,17 @@ class _Reader:
 
     store: Contacts
     config: ClipConfig
-    felt: bool
+    with_touch: bool
     augment: AugmentConfig
 
     def __call__(self, i: int, rng: np.random.Generator | None = None) -> dict[str, np.ndarray]:
         key = self.store.contacts[i]
         card = self.store.objects[key.object_id]
-        if self.felt:
+        if self.with_touch:
             contact = self.store.contact(i, fields=self.config.show == "fields")
             clip = make_clip(contact, card, self.config, augment=self.augment, rng=rng)
         else:
-            clip = make_unfelt_clip(key, card, self.config)
+            clip = make_clip_without_touch(key, card, self.config)
         return clip.arrays() | {"contact": np.array(i, np.int32)}
 
 
@@ -357,7 +359,7 @@ def _shown(sequence: Sequence, show: Shown) -> Sequence:
     if sequence.depth_mm is None and sequence.deformation_mm is None:
         raise SchemaError(
             f"{sequence.name}: has no fields, and show is 'fields': must have depth_mm or deformation_mm; write them "
-            "beside its pictures by `python -m sensors_io extract`"
+            "next to its pictures by `python -m sensors_io extract`"
         )
     return dataclasses.replace(sequence, frames=None)
 

@@ -12,7 +12,7 @@ from typing import Self
 import numpy as np
 
 from sensors_io.clock import NS_PER_S
-from sensors_io.errors import MALFORMED, told
+from sensors_io.errors import MALFORMED, name_and_text
 from sensors_io.force import ForceError, GravityModel, fit_gravity, gravity_directions
 from sensors_io.json_files import read_json, write_json
 
@@ -124,7 +124,9 @@ class ForceZero:
                 raise ValueError("weight_n must be finite, and down of length 1")
             return cls(model=model, down=down)
         except (OSError, *MALFORMED) as error:
-            raise ForceError(f"{path} holds no gravity model ({told(error)}); make one with `force-zero`") from error
+            raise ForceError(
+                f"{path} holds no gravity model ({name_and_text(error)}); make one with `force-zero`"
+            ) from error
 
 
 def fit_poses(poses: list[PoseReading]) -> ForceZero:

@@ -18,6 +18,7 @@ import dataclasses
 import datetime
 import os
 import pathlib
+import zlib
 from collections.abc import Callable, Container, Iterable, Mapping
 from collections.abc import Sequence as Seq
 from types import TracebackType
@@ -319,6 +320,15 @@ class RecordStore:
                 )
             contact[sensor] = sequence
         return contact
+
+    def checksum(self, i: int) -> int:
+        """CRC-32 of all that is stored of contact i, which `digest` does not cover.
+
+        Raises:
+          CorruptRecordsError: an entry that cannot be read.
+        """
+        found = [self._entries.decode(entry, zlib.crc32) for entry in self.contacts.entries(i).values()]
+        return zlib.crc32(np.array(found, np.uint32).tobytes())
 
     def fetch_ahead(self, contacts: Iterable[int]) -> None:
         """Begin to copy the shards of contacts from a store, in the order in which these are read."""

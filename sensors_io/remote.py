@@ -103,16 +103,16 @@ class Mirror:
             raise StoreError(f"the cache {self._cache} cannot be written ({error}): set {CACHE} to a folder") from error
 
     def fetch_ahead(self, files: Iterable[tuple[str, int]]) -> None:
-        """Begin to copy files, names and sizes, in their order beside the caller, as many as the cache holds."""
-        held, listed, lock = 0, iter(files), threading.Lock()
+        """Begin to copy files, given by name and size, in their order and in threads, as many as fit into the cache."""
+        total, listed, lock = 0, iter(files), threading.Lock()
 
         def work() -> None:
-            nonlocal held
+            nonlocal total
             while True:
                 with lock:
                     name, size = next(listed, ("", self._most + 1))
-                    held += size
-                if held > self._most:
+                    total += size
+                if total > self._most:
                     return
                 with contextlib.suppress(StoreError):  # whoever reads the file meets it too
                     self.fetch(name, size)
@@ -140,12 +140,12 @@ class Mirror:
         for file in filter(lambda file: _COPY.fullmatch(file.name), self._cache.iterdir()):
             with contextlib.suppress(FileNotFoundError):  # another process removes as well
                 files.append((file.stat().st_mtime, file.stat().st_size, file))
-        held = sum(bytes_ for _, bytes_, _ in files)
+        total = sum(bytes_ for _, bytes_, _ in files)
         for _, bytes_, file in sorted(files):
-            if held + size <= self._most:
+            if total + size <= self._most:
                 return
             file.unlink(missing_ok=True)
-            held -= bytes_
+            total -= bytes_
 
     def files(self) -> dict[str, str]:
         """File → MD5 where the store tells one, of its folders too; nothing where the folder does not exist yet."""
@@ -191,11 +191,11 @@ class Mirror:
                 full = getattr(error, "errno", None) == errno.ENOSPC
                 if lasting := _LASTING.get("full" if full else type(error).__name__):
                     raise StoreError(f"{where} {lasting[0]} ({error}): {lasting[1]}") from error
-                told = f"{where}: {type(error).__name__}: {error}"
+                reason = f"{where}: {type(error).__name__}: {error}"
                 if wait_s is None:
                     fix = "wait until the store answers and has room, and run the same command again"
-                    raise StoreError(f"{told}, {len(_WAITS_S) + 1} times: {fix}") from error
-                _LOG.warning("%s; trying again in %g s", told, wait_s)
+                    raise StoreError(f"{reason}, {len(_WAITS_S) + 1} times: {fix}") from error
+                _LOG.warning("%s; trying again in %g s", reason, wait_s)
                 time.sleep(wait_s)
             finally:
                 slow.cancel()

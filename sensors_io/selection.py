@@ -59,7 +59,7 @@ def choose_frames(sequence: Sequence, count: int, rejected: Seq[Flag], by: Choos
         value = peak = load
     else:
         change = _change(sequence, usable)
-        floor = np.partition(change, 1)[1]  # noise: the change of the quietest frame beside the first
+        floor = np.partition(change, 1)[1]  # noise: the change of the quietest frame but for the first
         value, peak = np.cumsum(np.maximum(change - floor, 0)), change if load is None else load
     if np.ptp(value) == 0:
         value = np.arange(usable.size)

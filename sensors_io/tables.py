@@ -166,8 +166,8 @@ class ContactTable(collections.abc.Sequence[ContactKey]):
         return packed
 
 
-def _of_two(said: str) -> CorruptRecordsError:
-    return CorruptRecordsError(f"{said}: root and tables are of two indices; copy all of them again from their source")
+def _of_two(text: str) -> CorruptRecordsError:
+    return CorruptRecordsError(f"{text}: root and tables are of two indices; copy all of them again from their source")
 
 
 def forget(rows: np.ndarray) -> None:

@@ -1,4 +1,4 @@
-"""Clocks of two devices compared by taps that both of them felt."""
+"""Clocks of two devices compared by taps that both of them measured."""
 
 import dataclasses
 
@@ -45,11 +45,11 @@ class TapOffset:
 
 
 class TapError(ValueError):
-    """Taps from which no offset can be told."""
+    """Taps from which no offset can be determined."""
 
 
 def tap_offset(a: Signal, b: Signal, *, max_offset_s: float = 0.5, min_taps: int = 3) -> TapOffset:
-    """Compare two clocks by taps that both devices felt.
+    """Compare two clocks by taps that both devices measured.
 
     A tap is taken at the moment it has risen to half of its peak, between samples by interpolation.  Of all shifts up
     to `max_offset_s` that bring one tap of a onto one of b, the one that pairs most is kept.

@@ -1,7 +1,7 @@
 """Work as units that are each done once, and the engines that run them: this machine, Ray, or Slurm by submitit.
 
 A unit is named by the hash of what it computes, takes its randomness from there, and writes its result in one step, so
-that it does not matter where, in which order and beside what it runs.  Whoever lists the units asks which are done and
+that it does not matter where, when and together with what it runs.  Whoever lists the units asks which are done and
 has the others run; a driver that was killed is started again with the same command.
 """
 

@@ -69,8 +69,8 @@ class TouchAnswer:
 
     def __str__(self) -> str:
         shares = ", ".join(f"{word} {p:.0%}" for word, p in self.probabilities.items())
-        said = f"{self.word or 'no readable answer'} ({shares})"
-        return said if self.untouched is None else f"{said}; without touch {self.untouched}"
+        answer = f"{self.word or 'no readable answer'} ({shares})"
+        return answer if self.untouched is None else f"{answer}; without touch {self.untouched}"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -179,8 +179,8 @@ class AskablePolicy:
         policy, params, n, a = self.saved.policy, self.saved.params, len(touches), len(self.attributes)
         features, unknown = self.encode(touches), np.full((n, a), -1, np.int32)
         contact, attribute = (np.tile(x.ravel(), 2) for x in np.mgrid[:n, :a])
-        felt = np.arange(len(contact))[:, None] < n * a
-        streams = np.asarray(features.stream_mask)[contact] & felt
+        with_touch = np.arange(len(contact))[:, None] < n * a
+        streams = np.asarray(features.stream_mask)[contact] & with_touch
         batch = question_batch(policy, features, unknown, contact, attribute, streams)
         tokens, level, share = self._decoded(of_decoder(params), batch)
 

@@ -84,11 +84,11 @@ def single_turn(
         touch_time=jnp.zeros((asked, 1, observed), jnp.int32),
         stream_mask=jnp.ones((asked, 1), bool),
     )
-    beside = ((0, 0), (0, observed))
+    widths = ((0, 0), (0, observed))
     given = GRPOBatch(
         features=features,
-        ids=jnp.pad(jnp.asarray(batch.ids), beside),
-        mask=jnp.pad(jnp.asarray(batch.mask), beside, constant_values=True),
+        ids=jnp.pad(jnp.asarray(batch.ids), widths),
+        mask=jnp.pad(jnp.asarray(batch.mask), widths, constant_values=True),
         target=batch.target,
     )
     sampled: dict[str, Any] = {"constrained": False, "enumerated": None, "learn_conclusion": True}

@@ -83,27 +83,27 @@ class Explorer:
         """
         shape = (1, len(self.contacts.choices))
         tokens = np.zeros((*shape, len(PROPERTIES), len(PROPERTIES) + LEVELS), np.float32)
-        made, felt = np.zeros(shape, bool), np.zeros(shape, bool)
+        made, observed = np.zeros(shape, bool), np.zeros(shape, bool)
         while True:
-            bank = self._bank(tokens, felt)
+            bank = self._bank(tokens, observed)
             chosen = explore(self.policy, self.params, bank, np.zeros(1, int), self.budget).choices[0, question]
             new = [int(c) for c in chosen if c != NO_CHOICE and not made[0, c]]
             if not new:
                 break
             made[0, new[0]], frames = True, give(new[0])
             if frames is not None:
-                tokens[0, new[0]], felt[0, new[0]] = self.tokens(new[0], frames), True
+                tokens[0, new[0]], observed[0, new[0]] = self.tokens(new[0], frames), True
         answer = answerer(self.policy, self.params, bank)
         level = np.exp(answer(np.zeros(1, int), np.array([question]), chosen[None]))[0]
         return Exploration(tuple(int(c) for c in chosen if c != NO_CHOICE), level / level.sum())
 
-    def _bank(self, tokens: np.ndarray, felt: np.ndarray) -> TouchBank:
+    def _bank(self, tokens: np.ndarray, observed: np.ndarray) -> TouchBank:
         """The contacts of the object so far."""
         return TouchBank(
             tokens=jnp.asarray(tokens),
-            available=jnp.asarray(felt),
+            available=jnp.asarray(observed),
             seconds=jnp.asarray(self.contacts.seconds)[None],
-            harm=jnp.zeros(felt.shape),
+            harm=jnp.zeros(observed.shape),
             label=jnp.zeros((1, len(PROPERTIES)), jnp.int32),
             choices=touch_choices(self.contacts),
         )

@@ -148,5 +148,5 @@ def count_right(policy: AskablePolicy, touches: Sequence[AskedTouch], objects: n
             continue
         share = clustered_bootstrap(100.0 * (np.asarray(asked.parsed.conclude)[rows, i] == true), of)
         constant = 100 * np.bincount(true).max() / len(true)
-        told = f"{share.mean:.1f} % {bounds(share.low, share.high, '.1f')} right of {len(rows)}"
-        yield f"  {name:<12} {told}; always the most frequent level {constant:.1f} %"
+        shown = f"{share.mean:.1f} % {bounds(share.low, share.high, '.1f')} right of {len(rows)}"
+        yield f"  {name:<12} {shown}; always the most frequent level {constant:.1f} %"

@@ -128,8 +128,10 @@ class AskCommand(Places):
             return
         answers = policy.answers([touch.touch for touch in touches])
         for touch, of_touch in zip(touches, answers, strict=True):
-            said = {name: answer_json(answer) for name, answer in of_touch.items()}
-            yield json.dumps({"touch": touch.name, "answers": said, "truth": dict(touch.truth)}, ensure_ascii=False)
+            by_attribute = {name: answer_json(answer) for name, answer in of_touch.items()}
+            yield json.dumps(
+                {"touch": touch.name, "answers": by_attribute, "truth": dict(touch.truth)}, ensure_ascii=False
+            )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

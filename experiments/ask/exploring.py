@@ -88,8 +88,8 @@ def explored(
     with compiled_quickly():  # programs that run a few times
         found = explorer.ask(list(WORDS).index(asked.name), contact)
     truth = WORDS[asked.name][solid_of(contacts.scenes, 0).levels()[asked.name]] if source else ""
-    said = exploration_line(explorer, found, question, truth)
-    return f"{said}; {len(unmade)} of them could not be made" if unmade else said
+    line = exploration_line(explorer, found, question, truth)
+    return f"{line}; {len(unmade)} of them could not be made" if unmade else line
 
 
 def request(choice: tuple[str, str, float]) -> str:
@@ -122,7 +122,7 @@ def unseen_object(contacts: ContactsConfig, source: str) -> ContactsConfig:
 def _person(
     contacts: ContactsConfig, say: Callable[[str], None], listen: Callable[[], str]
 ) -> Callable[[int], np.ndarray | None]:
-    """Recordings that a person names; what cannot be read is said, and asked for again."""
+    """Recordings that a person names; what cannot be read is reported and asked for again."""
 
     def give(choice: int) -> np.ndarray | None:
         sensor = contacts.choices[choice][0]
@@ -169,5 +169,5 @@ def exploration_line(explorer: Explorer, found: Exploration, question: str, trut
     shares = ", ".join(f"{word} {p:.0%}" for word, p in zip(words, found.probabilities, strict=True))
     number = f"{len(found.choices)} touch{'' if len(found.choices) == 1 else 'es'}"
     seconds = explorer.contacts.seconds[list(found.choices)].sum()
-    said = f"{question} {words[int(found.probabilities.argmax())]} ({shares}), after {number}, {seconds:.1f} s"
-    return f"{said}; truth {truth}" if truth else said
+    line = f"{question} {words[int(found.probabilities.argmax())]} ({shares}), after {number}, {seconds:.1f} s"
+    return f"{line}; truth {truth}" if truth else line

@@ -137,8 +137,8 @@ class Score:
                     metric = BENCH_METRICS[name]
                     mean, low, high = (format(row[end], metric.format) for end in ("mean", "low", "high"))
                     table.add_row(metric.title, mean, f"{low} – {high}", str(row["values"]), metric.meaning)
-                said = found["said"]
-            OUT.print(*([path] if len(units) > 1 else []), table, said, sep="\n")
+                summary = found["said"]
+            OUT.print(*([path] if len(units) > 1 else []), table, summary, sep="\n")
         return 0
 
 

@@ -42,5 +42,5 @@ def _score(items_file: Path, answers_file: Path, by_sight_file: Path | None, out
         row.name: {"mean": row.interval.mean, "low": row.interval.low, "high": row.interval.high, "values": row.values}
         for row in metric_rows(items, answers, None if by_sight_file is None else read(by_sight_file))
     }
-    said = f"parsed {100 * parsed_share(answers):.1f} %; {average_line(items, answers)}"
-    write_sealed(out, {"of": out.stem, "rows": rows, "said": said})
+    summary = f"parsed {100 * parsed_share(answers):.1f} %; {average_line(items, answers)}"
+    write_sealed(out, {"of": out.stem, "rows": rows, "said": summary})

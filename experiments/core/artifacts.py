@@ -119,9 +119,9 @@ def read_arrays(path: Path, of: str, *, earlier: bool = True) -> dict[str, np.nd
       ArraysError: they cannot be read, or are of something else, as a whole file that was put in this place.
     """
     arrays = load_arrays(path)
-    said = str(arrays.pop(_OF, of if earlier else ""))
-    if said != of:
-        reason = ValueError(f"it {f'is of {said}' if said else 'does not say what it is'}: must be of {of}")
+    label = str(arrays.pop(_OF, of if earlier else ""))
+    if label != of:
+        reason = ValueError(f"it {f'is of {label}' if label else 'does not say what it is'}: must be of {of}")
         raise ArraysError(f"{path} belongs elsewhere ({reason}); put its own copy back, or remove it") from reason
     return arrays
 

@@ -164,7 +164,7 @@ class Context:
     ) -> Iterator[Advance]:
         """Show a progress bar for one loop of `total` steps, of which earlier sessions `completed` some.
 
-        Until the first step the `note` stands beside it.  A `still` bar and those inside are redrawn with each step
+        Until the first step the `note` is shown next to it.  A `still` bar and those inside are redrawn with each step
         only, so that they take no time from what is timed.
         """
         loop = Loop(title, total, completed, still=still or any(outer.still for outer in self.loops), note=note)

@@ -24,7 +24,7 @@ SHARED = "#4d5560"
 """Colour of whatever belongs to no single series."""
 
 CONTROLS = {"sft": "#1d2126", "sft_continued": "#8c564b", "tactile_blind": SHARED}
-"""Colours of the policies that every study trains beside its arms; in curves they have stages of their own."""
+"""Colours of the policies that every study trains in addition to its arms; in curves they have stages of their own."""
 
 MARKERS = "osD^vXph"
 SYMBOLS = "●■◆▲▼✖⬟⬢"  # the markers in a text

@@ -21,7 +21,7 @@ ALARM = "alarm_"  # prefix of the logged metrics that hold alarms, followed by t
 
 KEPT = 2  # newest checkpoints of a stage
 
-COMPILING = "compiling the first step"  # note beside the bar of a stage until its first step is done
+COMPILING = "compiling the first step"  # note next to the bar of a stage until its first step is done
 
 MakeLog = Callable[[Context, str, int], Log]
 """From the run, a stage and its first step to what receives (step, metrics)."""

@@ -39,7 +39,7 @@ class Loop:
       total: steps of the whole loop.
       completed: steps of earlier sessions; they do not count into the rate.
       still: redraw with each step only, not ten times a second, which would take time from what is timed.
-      note: shown beside the bar until the first of its steps, such as "compiling".
+      note: shown next to the bar until the first of its steps, such as "compiling".
       clock: seconds.
     """
 

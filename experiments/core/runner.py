@@ -313,10 +313,10 @@ def _execute(experiment: Experiment[Any], command: Any, about: str, typed: str) 
                     _announce(directory, resumed)
                 _compute(experiment, command, directory, about, stopping, processes)
     except KNOWN_ERRORS as error:
-        told = f"{type(error).__name__}: {error}"
+        message = f"{type(error).__name__}: {error}"
         if isinstance(error, OSError) and error.errno == errno.ENOSPC:  # libraries do not say of which disk
-            told += f": free some space on the disks of {command.runs_dir} and {command.cache_dir}, then continue"
-        print_error(told if directory is None else f"{told}\n{fate()}")  # standard output may be on the full disk
+            message += f": free some space on the disks of {command.runs_dir} and {command.cache_dir}, then continue"
+        print_error(message if directory is None else f"{message}\n{fate()}")  # standard output may be on the full disk
         return 1
     except Stopped as stopped:
         print_lines(f"\nStopped by {stopped}. {fate()}")

@@ -40,7 +40,7 @@ PACKAGES = ("touchr1-jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint",
 FIELDS = frozenset({"experiment", "scale", "config", "git", "command"})
 """Fields in `config.json` of a run; that of a model has others."""
 
-LATEST = "latest"  # link to the newest run that computes, beside the runs
+LATEST = "latest"  # link to the newest run that computes, in the folder of the runs
 UNKNOWN = "unknown"  # commit of code outside a checkout
 ROOT = Path(__file__).resolve().parents[2]  # the checkout of this code, if there is one
 

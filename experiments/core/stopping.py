@@ -92,7 +92,7 @@ class Stopping:
             raise self._stopped(self._number or signal.SIGTERM)
 
     def leave(self, leaving: bool = True) -> None:
-        """Have all patient blocks end as if a signal had come, for a thread beside them failed; or no longer."""
+        """Have all patient blocks end as if a signal had come, because another thread failed; or no longer."""
         self._leaving = leaving
 
     def _open(self, blocks: int) -> None:

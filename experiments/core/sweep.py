@@ -291,7 +291,7 @@ def require_growth(folder: Path, name: str, units: Sequence[SweepUnit]) -> None:
         listed = {one["hash"]: (found["experiment"], _settings(one["settings"])) for one in found["units"]}
     except (LookupError, TypeError, AttributeError) as error:
         raise DamagedFileError(f"{path} is not that of a sweep ({error!r}): move it away to write it anew") from error
-    lacking = [told for digest, told in listed.items() if digest not in {unit.digest for unit in units}]
+    lacking = [unit for digest, unit in listed.items() if digest not in {one.digest for one in units}]
     if lacking:
         raise SweepError(
             f"into is {folder}: its sweep of {lacking[0][0]} has {len(lacking)} runs that this one leaves out, the "

@@ -57,7 +57,7 @@ class LoadMeasurement:
     """Seconds of one reading, bytes of parameters, largest resident size, and that of the process before it."""
 
     seconds: float
-    held: int
+    nbytes: int
     peak: int
     before: int
 
@@ -121,4 +121,4 @@ def _measure_here(reader: Reader, directory: Path, config: QwenConfig, progress:
     before, began = peak_memory(), time.perf_counter()
     leaves = jax.block_until_ready(reader(directory, config, progress))
     seconds = time.perf_counter() - began
-    return LoadMeasurement(seconds=seconds, held=sum(x.nbytes for x in leaves), peak=peak_memory(), before=before)
+    return LoadMeasurement(seconds=seconds, nbytes=sum(x.nbytes for x in leaves), peak=peak_memory(), before=before)

@@ -72,7 +72,7 @@ def run(config: LoadWeightsConfig, context: Context) -> Results:
     for size in context.each("looking for room", config.sizes):
         check_room(size, config.scratch, copies=2 if size in config.compare else 1)
     readings = {size: read_size(size, config, context) for size in context.each("sizes", config.sizes, still=True)}
-    ratios = {size: {name: r.peak / r.held for name, r in by.items()} for size, by in readings.items()}
+    ratios = {size: {name: r.peak / r.nbytes for name, r in by.items()} for size, by in readings.items()}
     return Results(
         verdict=verdict(readings),
         requirements=tuple(at_most(f"{size}: peak over weights", by[OURS], BOUND) for size, by in ratios.items()),
@@ -109,7 +109,7 @@ def read_size(size: str, config: LoadWeightsConfig, context: Context) -> dict[st
     finally:
         shutil.rmtree(directory)
     for name, r in readings.items():
-        context.print(f"{size}, {name}: {r.peak / r.held:.3f} × {r.held / GB:.2f} GB in {r.seconds:.1f} s")
+        context.print(f"{size}, {name}: {r.peak / r.nbytes:.3f} × {r.nbytes / GB:.2f} GB in {r.seconds:.1f} s")
     return readings
 
 
@@ -140,13 +140,13 @@ def physical_memory() -> int:
 
 def verdict(readings: Measured) -> tuple[str, ...]:
     """Memory and time to read the largest shape, and memory with all tensors first."""
-    largest, by = max(readings.items(), key=lambda item: item[1][OURS].held)
+    largest, by = max(readings.items(), key=lambda item: item[1][OURS].nbytes)
     ours = by[OURS]
     return (
-        f"Reading the {largest} shape, {ours.held / GB:.2f} GB, takes a process of {ours.peak / GB:.2f} GB at most, "
-        f"{ours.peak / ours.held:.3f} times the weights, and {ours.seconds:.0f} s.",
+        f"Reading the {largest} shape, {ours.nbytes / GB:.2f} GB, takes a process of {ours.peak / GB:.2f} GB at most, "
+        f"{ours.peak / ours.nbytes:.3f} times the weights, and {ours.seconds:.0f} s.",
         *(
-            f"All tensors first, the {size} shape takes {other[PLAIN].peak / other[PLAIN].held:.2f} times."
+            f"All tensors first, the {size} shape takes {other[PLAIN].peak / other[PLAIN].nbytes:.2f} times."
             for size, other in readings.items()
             if PLAIN in other
         ),
@@ -160,9 +160,9 @@ def table(readings: Measured) -> Table:
         [
             {
                 "size and reader": f"{size}, {name}",
-                "weights": r.held / GB,
+                "weights": r.nbytes / GB,
                 "peak": r.peak / GB,
-                "peak over weights": r.peak / r.held,
+                "peak over weights": r.peak / r.nbytes,
                 "process before": r.before / GB,
                 "time": r.seconds,
             }

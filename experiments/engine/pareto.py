@@ -184,7 +184,7 @@ def dominators(name: str, points: Sequence[ParetoPoint]) -> tuple[ParetoPoint, .
 
 
 def choice_table(judgements: Sequence[DefaultJudgement]) -> Table:
-    """Every measured choice beside the defaults, and the first one of the front that dominates it."""
+    """Every measured choice and the defaults, and the first one of the front that dominates it."""
     rows = []
     for j in judgements:
         for point in j.points:

@@ -215,7 +215,7 @@ class LongRun:
 
     Args:
       seconds: of every step, [n].
-      resident_mb: memory held after every `RESIDENT_EVERY` steps, [n / RESIDENT_EVERY].
+      resident_mb: resident memory after every `RESIDENT_EVERY` steps, [n / RESIDENT_EVERY].
       lengths: mean tokens of a completion, of the steps looked at the least and the most.
       programs: compiled for the step.
     """

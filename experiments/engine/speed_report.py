@@ -267,7 +267,7 @@ def over_prefixes(seconds: EngineFigures, memory_gb: EngineFigures, limits_s: Ma
 
 
 def over_steps(run: LongRun) -> bytes:
-    """Draw the time of a step, median and 5th to 95th percentile of every hundred, and the memory held."""
+    """Draw the time of a step, median and 5th to 95th percentile of every hundred, and the resident memory."""
     bins = run.seconds[: len(run.seconds) // RESIDENT_EVERY * RESIDENT_EVERY].reshape(-1, RESIDENT_EVERY)
     low, middle, high = 1e3 * np.percentile(bins, (5, 50, 95), axis=1)
     at = RESIDENT_EVERY * np.arange(1, len(bins) + 1)
@@ -276,6 +276,6 @@ def over_steps(run: LongRun) -> bytes:
     memory = Series(x=at, y=run.resident_mb, marker="")
     panels = [
         Panel([times], x_label="step", y_label="a step, ms", y_limits=(0, most_ms)),
-        Panel([memory], x_label="step", y_label="memory held, MB", y_limits=(0, most_mb)),
+        Panel([memory], x_label="step", y_label="resident memory, MB", y_limits=(0, most_mb)),
     ]
     return draw(panels, size=(8.2, 3.0))

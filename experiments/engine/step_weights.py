@@ -116,7 +116,7 @@ MEANINGS = {
     "compiling": "time of the processor until the recorded step is a program",
     "elapsed": "time on the clock of both, with waiting",
     "arguments": "parameters, state of the optimizer and batch",
-    "temporary": "what the step needs beside them",
+    "temporary": "what the step needs in addition",
     "reserved": "all that the compiler reserves",
     "first": "time of the first step, on drawn weights",
     "second": "time of the second step",

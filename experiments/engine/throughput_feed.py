@@ -128,11 +128,11 @@ def run(config: FeedingConfig, context: Context) -> Results:
             Picture(
                 name="cores",
                 title="Cores that a device needs for its batches",
-                caption="Processor time of a batch over the predicted time of a step; dotted: cores beside a device.",
+                caption="Processor time of a batch over the predicted time of a step; dotted: cores next to a device.",
                 content=bars({one.name: one.cores for one in fed}, "cores", bounds=(config.cores,), logarithmic=True),
             ),
         ),
-        settings={"cores here": cores_here(), "cores beside a device": config.cores},
+        settings={"cores here": cores_here(), "cores next to a device": config.cores},
     )
 
 
@@ -338,7 +338,7 @@ def feed_table(config: FeedingConfig, fed: Sequence[FeedMeasurement]) -> Table:
             "feed": "scale, stage, where clips or features lie",
             "made in": "processor time, all threads",
             "step": "predicted",
-            "cores needed": f"of {config.cores} beside a device",
+            "cores needed": f"of {config.cores} next to a device",
         },
         note=f"A step takes the time of its arithmetic at {100 * config.machine.flops_share:.0f} % of "
         f"{plain(config.machine.flops / 1e12)} TFLOP/s.",

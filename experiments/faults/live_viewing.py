@@ -81,7 +81,7 @@ def viewed(camera: NoiseCamera, seconds: float, browsers: int | None) -> dict[st
         watching = []
         if browsers is not None:
             live = stack.enter_context(LiveView(port=0))
-            stack.enter_context(Presenter([Channel(reader)], None, live).beside())
+            stack.enter_context(Presenter([Channel(reader)], None, live).in_thread())
             host, port = live.address.removeprefix("http://").rstrip("/").split(":")
             command = [sys.executable, "-c", BROWSER, host, port, str(seconds)]
             watching = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(browsers)]

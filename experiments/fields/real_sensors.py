@@ -48,7 +48,7 @@ HELD_OUT = {
 }
 """Column → figure of a calibration on the presses left out of it."""
 
-LETTERS = 18  # of a line beside the pictures
+LETTERS = 18  # of a line next to the pictures
 
 
 def run(config: RealConfig, context: Context) -> Results:

@@ -173,7 +173,7 @@ def failure_suite(grid: int) -> tuple[FailureCase, ...]:
         case("kernel overflow: h = 40 mm", r2 / 16, 5.0, gel=gel(thickness_mm=40.0)),
         case("a few pixels at 1 mN", r2 / 16, 1e-3, must_flag=True),
         case("a dozen pixels at 1 mN", dimple, 1e-3),
-        case("needle beside a shoulder", needle, 2.0),
+        case("needle next to a shoulder", needle, 2.0),
         case("rough flat, 75 % contact", _waves(x, 0.03), 15.0),
         case("full pad", np.zeros((grid, grid)), 5.0),
         case("white noise", 0.1 * noise, 5.0),

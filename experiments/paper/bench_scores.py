@@ -1,4 +1,4 @@
-"""Answers to the bench's questions, computed from answers about single touches; scores beside the paper's table.
+"""Answers to the bench's questions, computed from answers about single touches; scores next to the paper's table.
 
 A policy has one touch in its prompt.  It answers a question about several properties one by one, and a question about
 one sensor from that sensor alone.  Two touches are compared by the levels that the policy answers for them; if these

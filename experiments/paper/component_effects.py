@@ -1,4 +1,4 @@
-"""The effect of each component: differences of arms with intervals and corrected p-values, beside the paper's."""
+"""The effect of each component: differences of arms with intervals and corrected p-values, next to the paper's."""
 
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence

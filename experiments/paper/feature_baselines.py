@@ -163,7 +163,7 @@ def linear_probe(
 def encoder_probe(trained: TrainedPolicy, *, swapped: bool = False, picture: bool = False) -> Evaluation:
     """Levels by a linear probe on the encoded touch; `swapped` gives every contact the touch of another object.
 
-    With `picture` the probe reads the encoded picture too, beside all streams together and beside each alone.
+    With `picture` the probe reads the encoded picture too, with all streams together and with each alone.
     """
     data = trained.data
     rows = data.training

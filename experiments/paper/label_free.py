@@ -23,9 +23,9 @@ def agreed_levels(evaluation: Evaluation, label: Int[np.ndarray, "n A"]) -> Int[
         raise ValueError("evaluation.alone is None: agreement needs the answers of single streams; ask them")
     found = np.full(label.shape, UNKNOWN)
     for n, (contact, a) in enumerate(zip(evaluation.contact, evaluation.attribute, strict=True)):
-        said = evaluation.alone[n, evaluation.streams[n], a]
-        levels, counts = np.unique(said[said >= 0], return_counts=True)
-        if len(levels) and counts.max() >= AGREEING * len(said):
+        answered = evaluation.alone[n, evaluation.streams[n], a]
+        levels, counts = np.unique(answered[answered >= 0], return_counts=True)
+        if len(levels) and counts.max() >= AGREEING * len(answered):
             found[contact, a] = levels[counts.argmax()]
     return found
 

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from experiments.core import numerics
 from experiments.core.context import Context
 from experiments.recordings.scene_presses import PressVariant, press_pictures
-from sensors_io.errors import MALFORMED, told
+from sensors_io.errors import MALFORMED, name_and_text
 from sensors_io.importers.keep import ImportSourceError, Skip
 from sensors_io.importers.physiclear import read_labels
 from sensors_io.importers.video import VideoError
@@ -92,8 +92,8 @@ def describe_source(source: Path, frames: int, context: Context, objects: int | 
     unknown = np.full(len(LANGUAGE.attributes), np.nan)
     rating = np.array([rated.get(name, unknown) for name in found.objects]).reshape(len(found.names), -1)
     found, where = dataclasses.replace(found, rating=rating), hashlib.sha256(str(source).encode()).hexdigest()[:16]
-    held = hashlib.sha256(json.dumps([getattr(found, name).tolist() for name in ROWS]).encode()).hexdigest()[:16]
-    context.require_same(f"videos/{where}", held, f"videos, labels or ratings of {source}")
+    digest = hashlib.sha256(json.dumps([getattr(found, name).tolist() for name in ROWS]).encode()).hexdigest()[:16]
+    context.require_same(f"videos/{where}", digest, f"videos, labels or ratings of {source}")
     return found
 
 
@@ -105,7 +105,7 @@ def read_ratings(path: Path) -> dict[str, Float[np.ndarray, "A"]]:
         table = json.loads(path.read_text(encoding="utf-8"))["objects"]
         return {n: np.array([float(r.get(a.name, np.nan)) for a in LANGUAGE.attributes]) for n, r in table.items()}
     except MALFORMED as error:
-        raise ImportSourceError(f"{path}: {told(error)}; correct the entry or remove the file") from error
+        raise ImportSourceError(f"{path}: {name_and_text(error)}; correct the entry or remove the file") from error
 
 
 def videos_of(places: Sequence[Path]) -> list[Path]:

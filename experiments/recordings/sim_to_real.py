@@ -217,16 +217,16 @@ def fields_of_videos(
     rows = dict[str, list[Any]](x=[])
     for name in context.each("reading fields of videos", videos.names):
         touch = read_touch(config.data_dir / "videos" / str(name), config.frames)
-        ways: dict[str, Callable[[], np.ndarray]] = {
+        readers: dict[str, Callable[[], np.ndarray]] = {
             "fields s": functools.partial(fields_of, touch.frames, touch.rest, calibration),
             "pictures s": functools.partial(describe_frames, touch.difference),
             "course s": functools.partial(describe, touch),
         }
         made = dict[str, np.ndarray]()
-        for way, make in ways.items():
+        for name, make in readers.items():
             start = time.process_time()
-            made[way] = make()
-            rows.setdefault(way, []).append(time.process_time() - start)
+            made[name] = make()
+            rows.setdefault(name, []).append(time.process_time() - start)
         rows["x"].append(made["fields s"].tolist())
     return rows
 

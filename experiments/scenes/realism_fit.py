@@ -221,17 +221,17 @@ def shadow_gain(study: PressFit, context: Context) -> dict[str, float]:
       standard deviation without and with shadows, in grey levels.
     """
     size = DIRECTIONS * len(ELEVATIONS_DEG)
-    normal, right, held = np.zeros((size, size)), np.zeros((size, 3)), []
+    normal, right, held_out = np.zeros((size, size)), np.zeros((size, 3)), []
     for i, touch in context.each("shadows", enumerate(study.touches)):
         rows, left = _shadows(study, touch), residual(study, i)
         if i in study.held_out:
-            held.append((rows, left))
+            held_out.append((rows, left))
         else:
             normal, right = normal + rows.T @ rows, right + rows.T @ left
     ridge = fitting.RIDGE * np.trace(normal) * np.eye(len(normal))
     weights = np.linalg.solve(normal + ridge, right)
-    before = np.concatenate([left for _, left in held])
-    after = np.concatenate([left - rows @ weights for rows, left in held])
+    before = np.concatenate([left for _, left in held_out])
+    after = np.concatenate([left - rows @ weights for rows, left in held_out])
     return {
         "explained": float(1 - after.var() / before.var()),
         "residual_levels": float(255 * before.std()),

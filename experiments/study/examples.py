@@ -19,7 +19,7 @@ from touchr1_jax.training.evaluation import Evaluation, reward_terms
 
 FIELD_PX = 192  # side of a drawn field
 ARROWS = 12  # arrows along a side of a drawn field
-SCALE_PX = 58  # width of the scale beside it
+SCALE_PX = 58  # width of the scale next to it
 ARROW_PX = 14.0  # length of the longest arrow: it stays inside its cell
 
 
@@ -89,7 +89,7 @@ def rollouts_of(
 def field_picture(recording: Sequence) -> np.ndarray | None:
     """Indentation in colour and displacement as arrows at the strongest press, uint8 RGB; `None` without fields.
 
-    Colours span the frame's own depths, which a scale in mm beside them states; the longest arrow has `ARROW_PX`.
+    Colours span the frame's own depths, which a scale in mm next to them states; the longest arrow has `ARROW_PX`.
     """
     t = -1 if recording.force_n is None else int(np.argmin(recording.force_n[:, 2]))
     depth, moved = recording.depth_mm, recording.deformation_mm

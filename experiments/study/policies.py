@@ -101,10 +101,10 @@ def find_policy(name: str, runs_dir: Path, weights: Path | None = None) -> Askab
     )
 
 
-def require_own(folder: Path, said: object) -> None:
-    """`PolicyError` if a policy in the folder of a run `said` that it is another; earlier versions say nothing."""
-    if said and said != (own := runs.labelled(folder.parents[2], "/".join(folder.parts[-3:]))):
-        raise PolicyError(f"policy is {folder}: it is of {said}, must be of {own}; put its own copy back")
+def require_own(folder: Path, label: object) -> None:
+    """`PolicyError` if a policy in the folder of a run is labelled as another; earlier versions have no label."""
+    if label and label != (own := runs.labelled(folder.parents[2], "/".join(folder.parts[-3:]))):
+        raise PolicyError(f"policy is {folder}: it is of {label}, must be of {own}; put its own copy back")
 
 
 def require_published(folder: Path) -> None:

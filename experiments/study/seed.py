@@ -209,8 +209,8 @@ class StudySeed:
         values |= {"full_share": contacts.full_share}
         inputs = {**dataclasses.asdict(contacts.features), "noise": contacts.noise, "prior": arm.prior}
         inputs |= {"label": contacts.label, "truth": contacts.truth, "evidence": contacts.evidence}
-        held = {} if validation is None else _named(validation)
-        return self._shared("grpo", stage, train, values, {**params, "input": inputs, "validation": held})
+        scored = {} if validation is None else _named(validation)
+        return self._shared("grpo", stage, train, values, {**params, "input": inputs, "validation": scored})
 
     def continued(
         self, config: SFTConfig, contacts: EncodedContacts, validation: Validation | None, params: Params

@@ -106,7 +106,7 @@ def answer_feed(
     order: dict[str, Any] = {"batch_size": config.batch_size, "seed": seed, "own": own}
     return AnswerFeed(
         policy,
-        data.batches(data.parts["sft"], felt=not blind, augment=config.augment, **order),
+        data.batches(data.parts["sft"], with_touch=not blind, augment=config.augment, **order),
         evidence,
         questions=config.questions,
         blind=blind,
@@ -150,7 +150,7 @@ def encode_rows(
     touch = None if blind else computed_touch(policy, data, context)
 
     def encode(own: np.ndarray) -> Features:
-        clips = lambda: _clips(data, own, context, "encoding", batch_size=encoding.BATCH, felt=not blind)
+        clips = lambda: _clips(data, own, context, "encoding", batch_size=encoding.BATCH, with_touch=not blind)
         batches: Iterable[TouchBatch] = map(touch_batch, clips()) if touch is None else encoding.parts(touch, own)
         return encoding.encode_contacts(policy.fns, params, batches, blind=blind)
 

@@ -221,7 +221,7 @@ def _check_colours(presses: BallPresses, config: CalibrateConfig) -> None:
     change = change.reshape(-1, 3) - np.median(change, axis=(0, 1, 2))
     strong = change[np.abs(change).max(1) > _STRONG]
     if not len(strong):
-        return  # no contact at all, which is said of each press
+        return  # no contact at all, which is reported for each press
     _, second, first = np.sqrt(np.maximum(np.linalg.eigvalsh(strong.T @ strong / len(strong)), 0))
     if second < config.least_colours * first:
         raise CalibrationError(
@@ -251,28 +251,28 @@ def _check_size(presses: BallPresses, touches: Touches, config: CalibrateConfig)
 
 def _warnings(errors: BallErrors, touches: Touches, shape: tuple[int, int], config: CalibrateConfig) -> tuple[str, ...]:
     """Why the map may not transfer, and what to do about it."""
-    figures, said = errors.figures(), []
+    figures, problems = errors.figures(), []
     radius, bias = (figures[f"radius error {name}, %"] / 100 for name in ("median", "of the median"))
     depth_um = figures["depth rmse median, um"]
     if radius > config.sure_radius or depth_um > config.sure_depth_um:
-        said.append(
+        problems.append(
             f"the map will not transfer: unseen presses have a radius error of {radius:.1%} and a depth error of "
             f"{depth_um:.0f} um, must be ≤ {config.sure_radius:.1%} and ≤ {config.sure_depth_um:.0f} um; press more "
             "often, all over the window, with contacts of several sizes, none wider than 0.8 ball radii"
         )
     if abs(bias) > config.sure_bias:
-        said.append(
+        problems.append(
             f"slopes are {'steep' if bias < 0 else 'flat'}: unseen balls come out {abs(bias):.1%} too "
             f"{'small' if bias < 0 else 'large'}, must be ≤ {config.sure_bias:.1%}; check the ball's diameter, and "
             "that camera, lamps and background are those of the presses"
         )
     seen = coverage(touches, shape)
     if seen.share < config.sure_cover:
-        said.append(
+        problems.append(
             f"presses cover {seen.share:.0%} of the window, must be ≥ {config.sure_cover:.0%}: the map is extrapolated "
             f"in {seen.where()}; press there, at about ({seen.next_px[0]:.0f}, {seen.next_px[1]:.0f}) px"
         )
-    return tuple(said)
+    return tuple(problems)
 
 
 def _check_errors(errors: BallErrors, config: CalibrateConfig) -> None:

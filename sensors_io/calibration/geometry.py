@@ -34,7 +34,7 @@ _BEST_SHARE = 0.25  # of the strongest spots' contrast: what a pin shows at leas
 
 
 class GeometryError(UserError, ValueError):
-    """A board, or presses of a ball, from which no geometry can be told; the message says what to do about it."""
+    """A board, or presses of a ball, from which no geometry can be found; the message says what to do about it."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -139,7 +139,7 @@ class CameraGeometry:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Rectifier:
-    """Straightens pictures of one camera; where each pixel comes from is told once.
+    """Straightens pictures of one camera; where each pixel comes from is computed once.
 
     Args:
       size_px: rows and columns of the camera's pictures.

@@ -56,7 +56,7 @@ def approach_mm(contact_mm: float, ball_radius_mm: float, gel: Layer) -> float:
     """
     pressures, waves = _transforms()
     lifted = waves @ (normal_compliance(_WAVES / contact_mm, gel) * pressures).T
-    lifted /= lifted[0, 0]  # beside a column of ones, whatever the modulus
+    lifted /= lifted[0, 0]  # next to a column of ones, whatever the modulus
     gap = ball_radius_mm - np.sqrt(ball_radius_mm**2 - (_RADII * contact_mm) ** 2)
     found = np.linalg.lstsq(np.column_stack([-lifted, np.ones(len(_RADII))]), gap, rcond=None)[0]
     return float(found[-1])

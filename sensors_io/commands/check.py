@@ -23,7 +23,7 @@ class Check:
     Tables count what an import left out, and frames by quality flag: as recorded, and as the quality filters judge them
     today.  A table shows the least and greatest value of each array.  Another, by `--pictures`, looks at the pictures
     themselves: contact, its border and number, saturation, lost markers.  A dot stands where the records hold nothing
-    to tell a flag by.  Nothing is changed or deleted: a flag is a bit beside its frame, and whoever reads the records
+    to tell a flag by.  Nothing is changed or deleted: a flag is a bit stored with its frame, and who reads the records
     chooses which flags to leave out.
     """
 

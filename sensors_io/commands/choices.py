@@ -1,4 +1,4 @@
-"""Devices as the command line names them, one after the other with a + between, and how a command is told to stop."""
+"""Devices as the command line names them, one after the other with a + between, and how a command is stopped."""
 
 import contextlib
 import dataclasses

@@ -13,8 +13,8 @@ from rich.table import Table
 from sensors_io import overview
 from sensors_io.commands.console import OUT, progress_bar
 from sensors_io.commands.straightening import Straightening
-from sensors_io.fields.beside import FieldsJob, fields_beside
 from sensors_io.fields.extract import ExtractConfig, Extractor, joined
+from sensors_io.fields.extracted_records import FieldsJob, write_extracted
 from sensors_io.fields.recorded import RestGel
 from sensors_io.fields.sources import SourceError, read_picture, read_pictures
 from sensors_io.fields.types import Calibration, CalibrationError, Fields, write_whole
@@ -32,7 +32,7 @@ class Extract:
     """Extract depth, contact, deformation, shear and force from pictures, as arrays over frames in one npz file.
 
     A field that the input cannot carry is flagged in every frame, said so, and written as NaN on a grid of one point.
-    Records become new records with the fields beside the pictures if `--out` names a directory; an interrupted
+    Records become new records with both pictures and fields if `--out` names a directory; an interrupted
     extraction resumes.
     """
 
@@ -74,7 +74,7 @@ class Extract:
         return self._to_records(calibration)
 
     def _to_records(self, calibration: Calibration | None) -> int:
-        """New records, with the fields beside the pictures."""
+        """New records, with both pictures and fields."""
         if len(self.inputs) != 1 or not (self.inputs[0] / INDEX).exists():
             raise SourceError(
                 f"--out is {self.out}: must end in .npz unless the input is one directory of records; correct it"
@@ -93,7 +93,7 @@ class Extract:
             rows=self.rows,
         )
         with progress_bar("contacts") as progress:
-            skipped = fields_beside(job, self.out, progress=progress, launcher=self.launcher)
+            skipped = write_extracted(job, self.out, progress=progress, launcher=self.launcher)
         OUT.print(overview.summary_table(RecordStore(self.out)))
         if skipped:
             OUT.print(overview.skip_table(skipped, "not extracted"))

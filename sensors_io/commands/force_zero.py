@@ -79,8 +79,8 @@ def _take(sensor: Reader, finder: PoseFinder, wanted: int) -> np.ndarray | None:
 
 def _board(finder: PoseFinder, wanted: int, force_n: np.ndarray) -> Table:
     table = Table.grid(padding=(0, 2))
-    held = len(finder.poses)
-    table.add_row("poses", f"{held} of {wanted}", "turn to another direction and hold still" if held < wanted else "")
+    found = len(finder.poses)
+    table.add_row("poses", f"{found} of {wanted}", "turn to another direction and hold still" if found < wanted else "")
     table.add_row("reading", f"{np.linalg.norm(force_n):.2f} N", " ".join(f"{v:+.2f}" for v in force_n))
     return table
 

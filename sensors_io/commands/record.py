@@ -135,7 +135,7 @@ class Record(Bench):
         for sensor, count in (+report.silent).items():
             OUT.print(
                 f"{sensor} was silent at the beginning or end of {count} of {report.contacts} contacts: the frame "
-                "beside the gap is flagged time_gap; look at its connection",
+                "next to the gap is flagged time_gap; look at its connection",
                 highlight=False,
                 soft_wrap=True,
             )
@@ -182,12 +182,12 @@ class Record(Bench):
 
     @contextlib.contextmanager
     def _live_view(self, tactile: list[Reader], force: list[Reader], board: "_Board") -> Iterator[None]:
-        """A page beside the recording, drawn by threads of its own."""
+        """A page that is drawn in other threads while the recording goes on."""
         assert self.port is not None
         channels = Extraction(self.background, self.calibration, _MINI_MM_PER_PX).channels(tactile)
         with LiveView(port=self.port) as live:
             OUT.print(f"live view at {live.address}", highlight=False)
-            with Presenter(channels, force[0] if force else None, live, board.words).beside():
+            with Presenter(channels, force[0] if force else None, live, board.words).in_thread():
                 yield
 
 

@@ -61,7 +61,7 @@ class Snap(Bench):
             stack.enter_context(write_lock(self.out))
             live = stack.enter_context(LiveView(port=self.port))
             OUT.print(f"guidance at {live.address}, Ctrl-C ends", highlight=False)
-            guide, said, ended, broken = self._guide(pitch), "", "", 0
+            guide, shown, ended, broken = self._guide(pitch), "", "", 0
             while not stop.is_set() and not guide.done:
                 try:
                     sample = device.read(_TIMEOUT_S)
@@ -78,8 +78,8 @@ class Snap(Bench):
                     raise DeviceNotFoundError(f"{device.identity.sensor} gives no pictures: snap needs a camera")
                 guidance = self._see(guide, sample.frame)
                 self._show(live, device, guide, sample.frame, guidance)
-                if guidance.prompt.partition(",")[0] != said:
-                    said = guidance.prompt.partition(",")[0]
+                if guidance.prompt.partition(",")[0] != shown:
+                    shown = guidance.prompt.partition(",")[0]
                     OUT.print(guidance.prompt, markup=False, highlight=False)
         if broken:
             OUT.print(f"{broken} broken samples were left out", highlight=False)

@@ -46,7 +46,7 @@ class View(Bench):
             presenter = Presenter(channels, force[0] if force else None, live)
             OUT.print(f"{', '.join(c.name for c in channels)} at {live.address}, Ctrl-C ends", highlight=False)
             end_s = time.monotonic() + self.seconds if self.seconds else float("inf")
-            with presenter.beside():
+            with presenter.in_thread():
                 while not stop.is_set() and time.monotonic() < end_s:
                     try:
                         for reader in (*devices, *force):

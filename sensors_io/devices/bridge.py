@@ -7,7 +7,7 @@ in a process of its own and only bytes cross:
     python -m sensors_io view bridge --python ~/dmtac/bin/python --adapter dmtac --sensor dmtac_x --serial S2508080042
 
 That process starts without this project's PYTHONPATH, out of reach of Ctrl-C, and ends with its reader, also a killed
-one.  Both read the same monotonic clock, so that a frame keeps the stamp that it got beside the SDK.  A pipe carries
+one.  Both read the same monotonic clock, so that a frame keeps the stamp that the server gave it.  A pipe carries
 what the sensors send a dozen times over: see `stability_devices`.
 """
 

@@ -15,7 +15,7 @@ held: when it ends, whoever reads the frames is gone, and so is the server, howe
 
 An adapter is a generator function of one argument that yields (stamp, number or None, name → array), the stamp by
 `time.monotonic_ns()`, the fields on one grid.  The number is the SDK's own count of frames; without one, losses are
-told by the period and repeats by equal pictures.
+found by the period and repeats by equal pictures.
 """
 
 import _thread

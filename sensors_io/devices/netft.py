@@ -232,10 +232,10 @@ class NetFt:
         if not self._records:
             self._receive(timeout_s)
         stamp_ns, waited, record = self._records.popleft()
-        told, internal, status, *counts = RECORD.unpack(record)
-        number, *_, began_ns = self._number(told, internal, stamp_ns)
+        sent, internal, status, *counts = RECORD.unpack(record)
+        number, *_, began_ns = self._number(sent, internal, stamp_ns)
         if status & _STATUS_ERROR and not status & _STATUS_RANGE:
-            raise DeviceDataError(f"NetFT record {told} has status {status:#010x}: {_meaning(status)}")
+            raise DeviceDataError(f"NetFT record {sent} has status {status:#010x}: {_meaning(status)}")
         assert self._calibration is not None
         values = np.array(counts, np.float64)
         self._check_rate(number, stamp_ns, waited)
@@ -255,24 +255,24 @@ class NetFt:
         """Make the sensor take its present load as zero; only `force-zero` leaves a trace in the records."""
         self._command(Command.BIAS)
 
-    def _number(self, told: int, internal: int, stamp_ns: int) -> "_Numbered":
+    def _number(self, sent: int, internal: int, stamp_ns: int) -> "_Numbered":
         """The record, whose number goes on where the sensor's runs around.
 
         A sensor numbers the records of every stream anew, its internal samples as long as it has power.  Where they go
         on over a reopening, so does the number; otherwise number and clock begin anew.
         """
         last, reopened = self._last, self._reopened
-        began_ns, number = 0, told
+        began_ns, number = 0, sent
         if last is not None:
-            steps = self._taken(last, internal, stamp_ns) if reopened else _signed(told - last.told)
+            steps = self._taken(last, internal, stamp_ns) if reopened else _signed(sent - last.sent)
             if steps is None:
                 period_ns = NS_PER_S / self._config.rate_hz
-                began_ns = last.began_ns + stamp_ns - last.stamp_ns + round((last.number - told) * period_ns)
+                began_ns = last.began_ns + stamp_ns - last.stamp_ns + round((last.number - sent) * period_ns)
             else:
                 began_ns, number = last.began_ns, last.number + steps
             if reopened and (steps is None or self._rate.measured_hz is not None):
                 self._rate = _RateCheck(self._config.rate_hz)
-        found = _Numbered(number, told, internal, stamp_ns, began_ns)
+        found = _Numbered(number, sent, internal, stamp_ns, began_ns)
         self._first = found if self._first is None or reopened else self._first
         self._last, self._reopened = found, False
         return found
@@ -354,10 +354,10 @@ class NetFt:
 
 
 class _Numbered(NamedTuple):
-    """Number of a record, what the sensor told of it and of its internal sample, its arrival, the time of number 0."""
+    """Number of a record; its number and internal sample as sent; its arrival; the time of number 0."""
 
     number: int
-    told: int
+    sent: int
     internal: int
     stamp_ns: int
     began_ns: int

@@ -1,6 +1,6 @@
 """A recording as a device: at its true rate or in compressed time, with faults that a seed decides.
 
-What was injected is counted in `Replay.truth`, so that a reader's books can be held against it.
+What was injected is counted in `Replay.truth`, so that a reader's counts can be compared with it.
 """
 
 import dataclasses

@@ -156,16 +156,16 @@ def lock_settings(capture: Capture, lock: Lock, name: str) -> dict[str, Any]:
     refused = []
     for setting, prop in _SETTINGS.items():
         wanted = getattr(lock, setting)
-        held = True
+        locked = True
         if setting in _AUTOMATIC:
             automatic, manual = _AUTOMATIC[setting]
-            held = capture.set(automatic, manual) and capture.get(automatic) == manual
+            locked = capture.set(automatic, manual) and capture.get(automatic) == manual
         if wanted is not None:
-            held = capture.set(prop, wanted) and held
+            locked = capture.set(prop, wanted) and locked
         now = capture.get(prop)
-        held = held and (wanted is None or abs(now - wanted) <= 0.5)  # drivers round to whole steps
-        found |= {setting: now, f"{setting}_locked": held}
-        if not held:
+        locked = locked and (wanted is None or abs(now - wanted) <= 0.5)  # drivers round to whole steps
+        found |= {setting: now, f"{setting}_locked": locked}
+        if not locked:
             refused.append(f"{setting} is {now:g}" + ("" if wanted is None else f", asked for {wanted:g}"))
     if refused:
         warnings.warn(

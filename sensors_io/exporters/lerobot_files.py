@@ -122,8 +122,8 @@ class EpisodeFiles:
             return entry
         height, width, channels = entry["shape"]
         info = {"height": height, "width": width, "channels": channels, "codec": "h264", "pix_fmt": "gbrp"}
-        said = {f"video.{key}": value for key, value in info.items()} | {"video.fps": self._fps, "video.g": KEY_FRAMES}
-        return {**entry, "info": {**said, "video.is_depth_map": False, "is_depth_map": False, "has_audio": False}}
+        details = {f"video.{key}": value for key, value in {**info, "fps": self._fps, "g": KEY_FRAMES}.items()}
+        return {**entry, "info": {**details, "video.is_depth_map": False, "is_depth_map": False, "has_audio": False}}
 
     def _next_file(self) -> None:
         self._end_file()
@@ -161,9 +161,9 @@ class EpisodeFiles:
         for name, entry in self.features.items():
             if entry["dtype"] != "video":
                 shape, kind = entry["shape"], pa.from_numpy_dtype(entry["dtype"])
-                said = None
+                details = None
                 if len(shape) > 1:  # the types of the library `datasets`, by which LeRobot reads them
-                    said = {
+                    details = {
                         "ARROW:extension:name": f"datasets.features.features.Array{len(shape)}DExtensionType",
                         "ARROW:extension:metadata": json.dumps([shape, entry["dtype"]]),
                     }
@@ -171,7 +171,7 @@ class EpisodeFiles:
                         kind = pa.list_(kind)
                 elif shape != [1]:
                     kind = pa.list_(kind, shape[0])
-                fields.append(pa.field(name, kind, metadata=said))
+                fields.append(pa.field(name, kind, metadata=details))
         counts = [pa.field(name, pa.float32() if name == "timestamp" else pa.int64()) for name in _COUNTS]
         return pa.schema([*fields, *counts])
 

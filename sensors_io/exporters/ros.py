@@ -88,14 +88,14 @@ def export_rosbag(selected: Selected, out: pathlib.Path, progress: Progress) -> 
             for _, contact in selected.contacts(progress):
                 start = min(int(sequence.host_time_ns.min()) for sequence in contact.values())
                 later = 0 if start > end else end + APART_NS - start
-                for stamp, said in sorted(_moments(contact, later, make), key=lambda moment: moment[0]):
+                for stamp, sent in sorted(_moments(contact, later, make), key=lambda moment: moment[0]):
                     if (end := stamp) >= _END_NS:
                         raise ExportError(
                             f"a time is {stamp} ns: must be < {_END_NS}, those of ROS; leave it out by --contacts"
                         )
-                    if said.topic not in connections:
-                        connections[said.topic] = bag.add_connection(said.topic, said.kind, typestore=store)
-                    bag.write(connections[said.topic], stamp, store.serialize_cdr(said.message, said.kind))
+                    if sent.topic not in connections:
+                        connections[sent.topic] = bag.add_connection(sent.topic, sent.kind, typestore=store)
+                    bag.write(connections[sent.topic], stamp, store.serialize_cdr(sent.message, sent.kind))
         _rename(temporary, out.name)
 
 
@@ -105,15 +105,15 @@ def _moments(contact: Mapping[str, Sequence], later_ns: int, make: Make) -> Iter
         whole = {name: getattr(sequence, name) for name in names}
         for n, stamp in enumerate((sequence.host_time_ns + later_ns).tolist()):
             arrays = {name: None if array is None else array[n] for name, array in whole.items()}
-            yield from ((stamp, said) for said in touch_messages(sensor, stamp, arrays, make))
+            yield from ((stamp, sent) for sent in touch_messages(sensor, stamp, arrays, make))
 
 
 def _rename(folder: pathlib.Path, name: str) -> None:
     """Give the bag's file its final name, which its metadata state."""
     [file] = folder.glob("*.mcap")
-    said = folder / "metadata.yaml"
-    text = said.read_text(encoding="utf-8").replace(file.name, f"{name}.mcap")
-    said.write_text(text, encoding="utf-8")
+    metadata = folder / "metadata.yaml"
+    text = metadata.read_text(encoding="utf-8").replace(file.name, f"{name}.mcap")
+    metadata.write_text(text, encoding="utf-8")
     file.rename(folder / f"{name}.mcap")
 
 

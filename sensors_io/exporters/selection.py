@@ -20,7 +20,7 @@ import numpy as np
 
 from sensors_io.codec import encode_sequence
 from sensors_io.contents import put_rest_pictures, rest_pictures
-from sensors_io.errors import MALFORMED, UserError, told
+from sensors_io.errors import MALFORMED, UserError, name_and_text
 from sensors_io.index import RecordsMeta
 from sensors_io.json_files import seal, unseal
 from sensors_io.records import RecordsExistError, RecordStore, RecordWriter
@@ -225,7 +225,9 @@ def damage_named(path: pathlib.Path) -> Iterator[None]:
     except UserError:
         raise
     except UNREADABLE as error:
-        raise ExportError(f"{path} is no export of records, or damaged ({told(error)}); export them again") from error
+        raise ExportError(
+            f"{path} is no export of records, or damaged ({name_and_text(error)}); export them again"
+        ) from error
 
 
 def write_back(path: pathlib.Path, found: FoundExport, out: pathlib.Path, progress: Progress) -> None:
@@ -294,7 +296,7 @@ def library(name: str, extra: str) -> Any:
 
 @contextlib.contextmanager
 def published(out: pathlib.Path) -> Iterator[pathlib.Path]:
-    """A path beside `out` to write to, which takes its place if the block ends without an error, and else vanishes.
+    """A path next to `out` to write to, which takes its place if the block ends without an error, and else vanishes.
 
     Raises:
       ExportError: `out` is there already.

@@ -22,7 +22,7 @@ class ZeroConfig:
     Args:
       steep: slope beyond which a cell belongs to a contact or its rim.
       margin_mm: around such cells, nothing is taken for untouched: the gel sinks there too.
-      near_mm, sinks_mm: distance from such cells from which on the zero level is fitted, beside a sinking that decays
+      near_mm, sinks_mm: distance from such cells from which on the zero level is fitted, with a sinking that decays
         by 1/e over `sinks_mm`; around presses at known depth it is some 60 µm at 2 mm.
       bent, tilted: least share of untouched cells, for which a quadratic and a plane are fitted; below it a constant,
         and no zero level is known.
@@ -48,7 +48,7 @@ class Surface:
     Args:
       depth_mm: indentation, float32 [H, W].
       contacts: where it is touched.
-      untouched: share of the cells that the zero level was told from.
+      untouched: share of the cells that the zero level was fitted to.
       zero_known: whether they are enough for a plane; else depth is good up to a constant, a tilt and a bend.
     """
 
@@ -143,7 +143,7 @@ def zero_level(depth_mm: np.ndarray, slope: np.ndarray, mm_per_px: float, config
         sinking = np.exp(-away_mm / np.float32(config.sinks_mm))
         both = np.column_stack([terms, sinking.ravel()])
         fitted = np.linalg.lstsq(both[near.ravel()], coarse[near], rcond=None)[0]
-        low = fitted[:-1] if fitted[-1] > 0 else None  # gel that rises beside a contact is a fault of the slopes
+        low = fitted[:-1] if fitted[-1] > 0 else None  # gel that rises next to a contact is a fault of the slopes
     if low is None:
         low = np.linalg.lstsq(terms[still.ravel()], coarse[still], rcond=None)[0]
     return (_powers(*depth_mm.shape, degree) @ low.astype(np.float32)).reshape(depth_mm.shape)

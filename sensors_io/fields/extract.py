@@ -27,7 +27,7 @@ class ExtractConfig:
       nodes: of the vector fields along the longer side of the picture.
       gel: modulus, Poisson ratio and thickness; the modulus scales the forces.
       marker_depth_mm: of the pattern below the surface.
-      inverse: how loads are told; `gradient_free` off suits a gel whose thickness and Poisson ratio are known well.
+      inverse: how loads are computed; `gradient_free` off suits a gel whose thickness and Poisson ratio are known well.
       shear: `modelled` gives what the traction makes by the gel's compliance; `subtracted` the deformation less what
         the pressure makes, which supposes less of the traction and keeps the noise.
       zero, contact, quality: of depth, contact mask and saturation.
@@ -93,7 +93,7 @@ class Extractor:
         if self._deformation is None:
             reasons.append(f"deformation_mm, shear_mm: {self.evidence.reason}; use a gel with markers")
         elif self._shear is None:
-            reasons.append("shear_mm: needs depth_mm, from which the pressure is told")
+            reasons.append("shear_mm: needs depth_mm, from which the pressure is computed")
         return tuple(reasons)
 
     @property

@@ -13,7 +13,7 @@ whose penalty K says that loads of neighbouring nodes are alike over a length â„
 Nothing acts where nothing touches, and that is what the linear solution lacks: it spreads the load over the window.
 
 What pressure makes along the surface of any even layer is a gradient, so with `gradient_free` u and C lose their
-gradients first (`helmholtz.shear_matrix`).  Pressure is then told by the depth and traction by the rest: thickness and
+gradients first (`helmholtz.shear_matrix`).  Depth then gives the pressure, the rest gives the traction: thickness and
 Poisson ratio, wrong by a third or by .03, then cost little; where they are known well, the whole motion tells more.
 
 Sources: Golub, Heath & Wahba, Technometrics 21, 215, 1979 (cross-validation); Wahba 1990, ch. 1 (penalty as covariance,

@@ -43,12 +43,12 @@ class Neighbours:
         names, size = np.unique(label[found], return_counts=True)
         return [label == name for name in names[np.argsort(-size, kind="stable")]]
 
-    def beside(self, inner: np.ndarray) -> np.ndarray:
+    def adjacent(self, inner: np.ndarray) -> np.ndarray:
         """Points [P] that are not in a set but have a neighbour in it."""
-        beside = np.zeros(self._count, bool)
-        beside[self._first[inner[self._second]]] = True
-        beside[self._second[inner[self._first]]] = True
-        return beside & ~inner
+        adjacent = np.zeros(self._count, bool)
+        adjacent[self._first[inner[self._second]]] = True
+        adjacent[self._second[inner[self._first]]] = True
+        return adjacent & ~inner
 
     def _whole(self, displacement: np.ndarray, strain: float) -> np.ndarray:
         """Mask of the edges within the limit."""

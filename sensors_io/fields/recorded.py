@@ -36,7 +36,7 @@ class RestGel:
     def __post_init__(self) -> None:
         if self.rest_frames < 0 or (self.rest_frames and self.background is not None):
             raise SchemaError(
-                f"rest_frames is {self.rest_frames}: must be ≥ 0, and 0 beside a background; leave one of them out"
+                f"rest_frames is {self.rest_frames}: must be ≥ 0, and 0 with a background; leave one of them out"
             )
         if self.mm_per_px is not None and not 0 < self.mm_per_px < 1:
             raise SchemaError(f"mm_per_px is {self.mm_per_px}: must lie in (0, 1); give millimetres per pixel")
@@ -145,7 +145,7 @@ def recorded_fields(sequence: Sequence, extractor: Extractor) -> Fields:
 
 
 def with_fields(sequence: Sequence, fields: Fields, calibration: str, rows: int = 0) -> Sequence:
-    """The sequence with depth, deformation, shear and force beside its pictures, on one grid.
+    """The sequence with depth, deformation, shear and force added to its pictures, on one grid.
 
     Depth and contact are brought to `rows` rows by area means, vector fields by linear interpolation.  A field that the
     pictures cannot carry stays absent; that alone flags no frame.  A measured force stays as it was recorded.

@@ -5,7 +5,7 @@ spreads the gel, and carries its markers towards the lens, which magnifies the p
 
 It is taken as the response of an even layer to the traction that explains the picture best, not as the deformation less
 the pressure's part: that keeps the noise of every node.  A layer taken too thick or too stiff in volume cannot be
-told from what is left unexplained, since some traction always explains it; see `inversion` for what guards against it.
+inferred from what is left unexplained, since some traction always explains it; `inversion` says what guards against it.
 """
 
 import dataclasses

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 COLOUR_SCALE = 64.0
-"""Grey levels; changes of this size are common, so that no power of d vanishes beside another."""
+"""Grey levels; changes of this size are common, so that no power of d vanishes compared with another."""
 
 SMOOTHING_PX = 0.7
 """Standard deviation of the Gaussian that the change is smoothed with: camera noise, less than the blur of the lens."""

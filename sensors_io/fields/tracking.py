@@ -35,7 +35,7 @@ _BACK_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 5, 0.03)
 _PIECES = 3  # that are tried as the one that is right
 _RINGS = 12  # that grow around a piece at most
 _NEARLY_ALL = 0.9  # share of the most points that any start leaves whole
-_SAMPLED_PX = 4  # of which exposure is told: every so many along both axes
+_SAMPLED_PX = 4  # from which exposure is estimated: every so many along both axes
 _LIGHT_OF_CONTACT = 0.1  # relative change of the median that a contact's own shading may make
 
 
@@ -48,7 +48,7 @@ class TrackingConfig:
       likeness: least correlation of a window with itself at rest.
       spread_px: greatest standard deviation of a point that noise may make; at twice as much it may be a pixel off.
       strain: greatest difference of two neighbours' displacements over their distance; a gel's own stays below 0.4, a
-        mistaken dot beside a right one makes 0.6 and more.
+        mistaken dot next to a right one makes 0.6 and more.
       safe_strain: the same, below which a piece is taken for right, to grow from.
       surprise: greatest difference from what all other points predict, over the points' pitch.
       reseed_share: of points that fail, above which a new start is looked for.
@@ -226,7 +226,7 @@ class Tracker:
 
     def _grow(self, picture: np.ndarray, points: np.ndarray, piece: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         for _ in range(_RINGS):
-            ring = self._neighbours.beside(piece)
+            ring = self._neighbours.adjacent(piece)
             start = self._start + self.spline.filled(points - self._start, piece)
             found_at, found = self._forth_unscaled(picture, start)
             points = np.where(piece[:, None], points, found_at)

@@ -173,7 +173,7 @@ class Calibration:
 
 
 def write_whole(path: pathlib.Path, data: bytes) -> None:
-    """Write a file by way of a temporary one beside it, so that no reader ever sees half of it."""
+    """Write a file by way of a temporary one in the same folder, so that no reader ever sees half of it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:

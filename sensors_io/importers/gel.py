@@ -56,7 +56,7 @@ class SourceGel:
         return hashlib.sha256(f"{of_source} {self.mm_per_px}".encode() + picture).hexdigest()[:16]
 
     def store(self, out: pathlib.Path) -> None:
-        """Write the picture of the gel at rest beside the records.
+        """Write the picture of the gel at rest into the folder of the records.
 
         Raises:
           ImportSourceError: it cannot be read.

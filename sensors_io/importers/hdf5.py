@@ -67,9 +67,9 @@ def list_hdf5(source: pathlib.Path, config: HDF5Config) -> Catalogue:
     contacts: dict[ContactKey, Listed] = {}
     cards: dict[str, ObjectCard] = {}
     trials: dict[ContactKey, int] = {}  # the next one of those that a layout does not number
-    names = plain_names((said for _, said, _, _ in found), "object")
-    for place, said, key, card in found:
-        key = dataclasses.replace(key, object_id=names[said])
+    names = plain_names((name for _, name, _, _ in found), "object")
+    for place, name, key, card in found:
+        key = dataclasses.replace(key, object_id=names[name])
         card = dataclasses.replace(card, object_id=key.object_id)
         if cards.setdefault(key.object_id, card) != card:
             skipped.append(Skip(name=place.name, reason=f"labels object {key.object_id!r} unlike an earlier one"))
@@ -197,12 +197,13 @@ def _facts(file: Any, place: Place, layout: LayoutMap, annotator: str) -> tuple[
         _stated(file, place, layout.values[name], name) if name in layout.values else otherwise
     )
     try:
-        said = str(value("object_id", place.name))
+        object_name = str(value("object_id", place.name))
         whole = {name: _whole(value(name, 0), name) for name in ("site", "trial")}
         key = ContactKey(object_id="object", motion=str(value("motion", "free")), **whole)
         labels = {a: _level(a, _stated(file, place, of, a), of.names) for a, of in layout.labels.items()}
-        name = said.replace("_", " ")
-        return said, key, ObjectCard(object_id="object", split="train", labels=labels, annotator=annotator, name=name)
+        shown = object_name.replace("_", " ")
+        card = ObjectCard(object_id="object", split="train", labels=labels, annotator=annotator, name=shown)
+        return object_name, key, card
     except SchemaError as error:
         raise HDF5Error(str(error)) from error
 
@@ -246,10 +247,10 @@ def _whole(value: Any, name: str) -> int:
 
 def _level(attribute: str, value: Any, names: Mapping[str, int] | None) -> int:
     if names is not None:
-        said = spelled(value)
-        if said not in names:
-            raise HDF5Error(f"{attribute} is {said!r:.60}: the names of the mapping lack it")
-        return names[said]
+        level = spelled(value)
+        if level not in names:
+            raise HDF5Error(f"{attribute} is {level!r:.60}: the names of the mapping lack it")
+        return names[level]
     if attribute == "material" and str(value) in MATERIALS:
         return MATERIALS.index(str(value))
     try:

@@ -152,8 +152,8 @@ def _named(attribute: str, where: Mapping[str, str], values: set[str]) -> dict[s
 def _lines(group: Any, indent: str, listed: dict[Any, str]) -> Iterator[str]:
     """Lines of a group; one that links lead to once more is not listed again."""
     for name in group.attrs:
-        said = str(stated(group, name)) if group.attrs.get_id(name).shape is not None else ""
-        yield f"{indent}@{name} = {''.join(c if c.isprintable() else ' ' for c in said[:60])}"
+        text = str(stated(group, name)) if group.attrs.get_id(name).shape is not None else ""
+        yield f"{indent}@{name} = {''.join(c if c.isprintable() else ' ' for c in text[:60])}"
     seen: dict[tuple[Any, ...], list[str]] = {}
     for name, item in group.items():
         named(name)
@@ -228,8 +228,8 @@ def _kind(name: str, data: Any) -> str | None:
 
 def _entry(name: str, kind: str, data: Any, rows: Mapping[str, str] | None) -> dict[str, Any]:
     quantity, entry = QUANTITIES[kind], {"path": name}
-    said = next((str(data.attrs[a]) for a in STATED if a in data.attrs), "")
-    unit = SPELLED.get(said.strip().lower(), said.strip())
+    unit = next((str(data.attrs[a]) for a in STATED if a in data.attrs), "")
+    unit = SPELLED.get(unit.strip().lower(), unit.strip())
     if kind != "frames":
         entry["unit"] = unit if unit in UNITS[quantity.kind] else PLACEHOLDER
     whole: dict[str, Any] = dict(entry)

@@ -280,18 +280,18 @@ class _Rows:
         for name in STATED:
             if name not in self.data.attrs:
                 continue
-            for said in map(spelled, stated(self.data, name).ravel()):  # some programs state one for each component
-                unit = SPELLED.get(said.strip().lower(), said.strip())
+            for spelling in map(spelled, stated(self.data, name).ravel()):  # some programs state one for each component
+                unit = SPELLED.get(spelling.strip().lower(), spelling.strip())
                 if unit in UNITS["picture"]:
                     continue
                 known = any(unit in of_kind for of_kind in UNITS.values())
                 if not known and units is not UNITS["picture"]:
                     self.notes.append(
-                        f"{array.path} states the unit {said!r}, which is not known: taken for {array.unit!r}"
+                        f"{array.path} states the unit {spelling!r}, which is not known: taken for {array.unit!r}"
                     )
                 elif known and units.get(unit) != array.factor:
                     raise HDF5Error(
-                        f"{array.path} states the unit {said!r}, the mapping {array.unit!r} for {self.what}"
+                        f"{array.path} states the unit {spelling!r}, the mapping {array.unit!r} for {self.what}"
                     )
 
     def _raw(self, positions: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from sensors_io.errors import MALFORMED, told
+from sensors_io.errors import MALFORMED, name_and_text
 from sensors_io.importers.catalogue import Catalogue, Listed, Taken, fingerprint
 from sensors_io.importers.holdout import hold_out
 from sensors_io.importers.keep import ImportSourceError, Keep, Skip, check_share
@@ -107,7 +107,7 @@ def read_labels(path: pathlib.Path) -> list[LabelledObject]:
         entries = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=distinct)["objects"]
         objects = [_labelled(entry) for entry in entries]
     except MALFORMED as error:
-        raise ImportSourceError(f"{path}: {told(error)}; correct the entry") from error
+        raise ImportSourceError(f"{path}: {name_and_text(error)}; correct the entry") from error
     for what, names in (
         ("object", [entry.card.object_id for entry in objects]),
         ("video", [name for entry in objects for name in entry.videos]),

@@ -138,7 +138,7 @@ def numbered(folder: pathlib.Path, suffixes: tuple[str, ...] = (".jpg", ".jpeg",
 
 
 def inside(folder: pathlib.Path) -> Iterator[pathlib.Path]:
-    """All that lies below a folder, also behind links, but for hidden names: macOS writes ._a.png beside a.png.
+    """All that lies below a folder, also behind links, but for hidden names: macOS writes ._a.png next to a.png.
 
     A folder that several links lead to is given once, without a link where it can be.
 

@@ -192,21 +192,21 @@ def _cards(row_of: Mapping[str, LabelRow], objects: Mapping[str, str], config: V
             raise LabelsError(f"{clip if row is None else row.place}: {error}") from error
         if row is not None and cards.setdefault(name, card) != card:
             raise LabelsError(
-                f"{row.place}: {name!r} has {_said(card)}, an earlier line {_said(cards[name])}: an object has one of "
-                "each; correct one of the lines"
+                f"{row.place}: {name!r} has {_columns(card)}, an earlier line {_columns(cards[name])}: an object has "
+                "one of each; correct one of the lines"
             )
         cards.setdefault(name, card)
-    told = {objects[clip] for clip, row in row_of.items() if row.cells.get(SPLIT)}
-    new = [name for name, card in cards.items() if card.labels and name not in told]
+    given = {objects[clip] for clip, row in row_of.items() if row.cells.get(SPLIT)}
+    new = [name for name, card in cards.items() if card.labels and name not in given]
     least = 1 / len(new) if len(new) > 2 else 0.0
     shares = {share: max(x, least) if (x := getattr(config, share)) else 0.0 for share in ("val_share", "test_share")}
     splits = split_by_name(new, **shares)
     return {name: dataclasses.replace(card, split=splits.get(name, card.split)) for name, card in cards.items()}
 
 
-def _said(card: ObjectCard) -> str:
-    said = {**card.labels, SPLIT: card.split, NAME: card.name}
-    return ", ".join(f"{name} {value}" for name, value in said.items())
+def _columns(card: ObjectCard) -> str:
+    columns = {**card.labels, SPLIT: card.split, NAME: card.name}
+    return ", ".join(f"{name} {value}" for name, value in columns.items())
 
 
 def _read(path: pathlib.Path, key: ContactKey, config: VideosConfig) -> Taken:

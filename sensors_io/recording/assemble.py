@@ -22,7 +22,7 @@ from sensors_io.schema import FRAME_ARRAYS, ContactKey, Flag, Phase, Sequence
 
 _GAP_PERIODS = 1.5  # between two frames: one is missing
 _GAP_STEPS = 3.0  # of the usual size, where the period is unknown
-_SILENT_S = 1.0  # beside a counter that goes on: a device is taken as lost sooner
+_SILENT_S = 1.0  # while its counter goes on: a device is taken as lost sooner
 _UNSEEN_S = 0.3  # without a frame in a phase, or at either end of a contact: a link is not so late
 _UNSEEN_PERIODS = 3  # of a slow sensor
 _INT64 = np.iinfo(np.int64)
@@ -133,7 +133,7 @@ def _until_ns(span_ns: tuple[int, int], stream: Mapping[str, Any]) -> int:
 
 
 def _unseen_s(period_s: float | None, time_ns: np.ndarray) -> float:
-    """Seconds without a frame that no late link explains; the usual step may be longer than the period that is told."""
+    """Seconds without a frame that no late link explains; the usual step may be longer than the stated period."""
     step_s = float(np.median(np.diff(np.sort(time_ns)))) / NS_PER_S if len(time_ns) > 1 else 0.0
     return max(_UNSEEN_S, _UNSEEN_PERIODS * max(period_s or 0.0, step_s))
 
@@ -261,7 +261,7 @@ def _mend(arrays: dict[str, Any]) -> dict[str, np.ndarray]:
     """Put 0 where a value is not finite, or too large for the records; fields are not `valid` there.
 
     Returns:
-      Array → rows that held such a value, bool [N]; an array without any is left out.
+      Array → rows with such a value, bool [N]; an array without any is left out.
     """
     broken = {}
     for name in [name for name in arrays if name in LARGEST]:

@@ -1,4 +1,4 @@
-"""The records of a session and the journals beside them: what is done, what is wanted next, what a kill left behind."""
+"""The records of a session and their journals: what is done, what is wanted next, what a kill left behind."""
 
 import collections
 import dataclasses
@@ -63,7 +63,7 @@ class Report:
 
 
 class Book:
-    """The records and the journals beside them."""
+    """The records and their journals."""
 
     def __init__(self, writer: RecordWriter, journals: pathlib.Path, report: Report):
         self._writer, self._journals, self._report = writer, journals, report

@@ -31,7 +31,7 @@ from sensors_io.schema import MOTIONS, ContactKey, Phase, SchemaError, require_n
 
 _UNTOUCHED_S = 10.0  # of a pause before the first touch the last 10 to 20 s are kept: contacts are stored from memory
 _NAME_BYTES = 255  # of a file, in the common file systems
-_SILENT_S = 1.0  # of the force sensor beside a camera that goes on
+_SILENT_S = 1.0  # of the force sensor while a camera goes on
 _IDLE_S = 0.002  # between looks at the devices; a tenth of the fastest camera's period
 
 
@@ -248,9 +248,9 @@ class _Session:
             measured = self._measured(self._force.drain(), journal)
             self._watch(measured[0], looked)
             return measured
-        told = [i for i, samples in enumerate(looked) if samples and "force_n" in samples[0].arrays]
-        if self._leads is None and told:
-            self._leads = self._streams[told[0]]
+        with_force = [i for i, samples in enumerate(looked) if samples and "force_n" in samples[0].arrays]
+        if self._leads is None and with_force:
+            self._leads = self._streams[with_force[0]]
         if self._leads is not None:
             samples = looked[self._streams.index(self._leads)]
             return self._leads.time_ns(samples), _stacked(samples, "force_n")

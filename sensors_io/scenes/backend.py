@@ -22,8 +22,8 @@ def require_backend() -> None:
     try:
         jax.devices()
     except (RuntimeError, AssertionError) as error:  # where no platform is left, JAX only asserts that there is one
-        said = f" ({error})" if str(error) else ""
+        reason = f" ({error})" if str(error) else ""
         raise BackendError(
-            f"{PLATFORMS} is {os.environ.get(PLATFORMS)!r}: must name platforms of this machine{said}; unset it, or "
+            f"{PLATFORMS} is {os.environ.get(PLATFORMS)!r}: must name platforms of this machine{reason}; unset it, or "
             "install JAX for that platform"
         ) from error

@@ -230,9 +230,9 @@ def _look(
 
     def tell(found: contact.Contact, gaps: tuple[Array, Array, Array], modulus: Array) -> CoarseSolve:
         share = gel_share(gel, body / modulus)
-        told = survey(found.pressure_mpa, found.displacement_mm, gaps, share, window, thickness)
-        index, promised, met = pick(error, log_error(told, law, MENU), law)
-        return CoarseSolve(contact=found, survey=told, index=index, promised=promised, met=met)
+        surveyed = survey(found.pressure_mpa, found.displacement_mm, gaps, share, window, thickness)
+        index, promised, met = pick(error, log_error(surveyed, law, MENU), law)
+        return CoarseSolve(contact=found, survey=surveyed, index=index, promised=promised, met=met)
 
     gaps, force, modulus = given
     found = map_live(one, live, (gaps[0], force, modulus))

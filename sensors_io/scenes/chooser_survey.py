@@ -2,7 +2,8 @@
 
 Inside a contact the surfaces lie on each other, so whatever of the gap the grid does not resolve there is missing from
 the displacement: that part of the error is read off finer gaps, without solving anything.  What the contact's edge and
-the free surface lose is told by how rough the coarse solution is on its own grid, and by the shape of the contact.
+the free surface lose is estimated from the roughness of the coarse solution on its own grid, and from the contact's
+shape.
 """
 
 import jax.numpy as jnp

@@ -80,8 +80,8 @@ def _log_errors(press: Press, path: Path, modulus_factor: Array, gel: Array, bod
         found = contact.solve(gap, at.force_n, soft, series, spacing, LOOK.tolerance, thickness_mm=thickness)
         share = gel_share(soft, series)
         gaps = (gap, finer, finest)
-        told = survey(found.pressure_mpa, found.displacement_mm, gaps, share, sensor.window_mm, thickness)
-        return log_error(told, LAW, menu(sensor))
+        surveyed = survey(found.pressure_mpa, found.displacement_mm, gaps, share, sensor.window_mm, thickness)
+        return log_error(surveyed, LAW, menu(sensor))
 
     return jax.lax.map(one, path)
 

@@ -1,6 +1,6 @@
 """The press and the six exploratory motions over time: what the hand commands, before any physics.
 
-Everything is told in the gel's frame (x right, y down, z out of the gel): the object moves, the gel stands still.  The
+Everything is given in the gel's frame (x right, y down, z out of the gel): the object moves, the gel stands still.  The
 hand controls the normal force; the object's rigid displacement along the gel, its twist about the normal and its tilt
 are prescribed.  Speeds are constant within a phase.  Amplitudes, speeds and shares of frames are our choice: they keep
 the contact inside a 15 mm window and take every contact through full slip and back at a friction of 0.2 to 1.

@@ -103,7 +103,7 @@ def with_rule(picture: np.ndarray, width_mm: float | None) -> np.ndarray:
 
 
 def with_bar(picture: np.ndarray, top_mm: float) -> np.ndarray:
-    """The picture beside the colours from 0 to `top_mm`, with both numbers."""
+    """The picture next to the colours from 0 to `top_mm`, with both numbers."""
     height, unit = picture.shape[0], picture.shape[1] / _DRAWN_PX
     top, left = f"{top_mm:g} mm", round(21 * unit)
     (width, _), _ = cv2.getTextSize(top, _FONT, _FONT_SCALE * unit, round(3 * unit))

@@ -22,7 +22,7 @@ from sensors_io.viewer.panels import SCALES, Panel, panels
 from sensors_io.viewer.server import LiveView, Numbers
 
 _OVERLOAD_N = 22.0  # at which the hand is told to stop; half of what the sensors bear
-_RATE_S = 1.0  # over which rates are told
+_RATE_S = 1.0  # over which rates are measured
 _STALE_S = 1.0  # an older sample is not shown as if it were new
 _FRAME_S = 1 / 30  # between two published states: screens show no more
 
@@ -180,7 +180,7 @@ class Presenter:
             time.sleep(max(0.0, _FRAME_S - (time.monotonic() - began_s)))
 
     @contextlib.contextmanager
-    def beside(self) -> Iterator[None]:
+    def in_thread(self) -> Iterator[None]:
         """Publish from a thread of its own while the block runs: what goes on there never waits for a picture."""
         done = threading.Event()
         thread = threading.Thread(target=self.run, args=(done.is_set,), name="presenter", daemon=True)
@@ -206,15 +206,15 @@ class Presenter:
         return name if len(self._channels) == 1 else f"{channel.name}: {name}"
 
     def _newtons(self) -> tuple[float, float, float] | None:
-        told = [c.sample.arrays["force_n"] for c in self._channels if c.sample and "force_n" in c.sample.arrays]
+        forces = [c.sample.arrays["force_n"] for c in self._channels if c.sample and "force_n" in c.sample.arrays]
         if self._force is not None:
             try:
-                told = [self._force.latest(_STALE_S).arrays["force_n"]]
+                forces = [self._force.latest(_STALE_S).arrays["force_n"]]
             except StaleFrameError:
                 return None
-        if not told:
+        if not forces:
             return None
-        x, y, z = map(float, told[0])
+        x, y, z = map(float, forces[0])
         return (x, y, z) if np.isfinite([x, y, z]).all() else None
 
     def _tables(self, newtons: tuple[float, float, float] | None) -> dict[str, Mapping[str, str]]:

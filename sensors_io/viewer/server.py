@@ -28,7 +28,7 @@ from sensors_io.viewer.panels import Panel
 
 _QUALITY = 85  # of the pictures' JPEG; recordings are lossless, a view need not be
 _CONNECTIONS = 64
-"""Open at once: ten browsers with their six, and what is half open; more are told so and closed at once."""
+"""Open at once: ten browsers with their six, and what is half open; more get an error and are closed at once."""
 _FULL = f"{_CONNECTIONS} connections are open, and no more are served: close other tabs of this page, and load it again"
 _SILENT_S = 10.0  # a connection that sends or takes nothing for so long is closed
 _WAIT_S = 1.0  # how long a stream that has nothing new waits before it looks whether the view has ended
@@ -179,8 +179,8 @@ class LimitedServer(http.server.ThreadingHTTPServer):
         try:
             super().__init__(address, handler)
         except OSError as error:
-            told = f"{error.strerror}: {address[0]}:{address[1]}; name another --port, or 0 for a free one"
-            raise OSError(error.errno, told) from error
+            reason = f"{error.strerror}: {address[0]}:{address[1]}; name another --port, or 0 for a free one"
+            raise OSError(error.errno, reason) from error
         self._free = threading.Semaphore(_CONNECTIONS)
 
     def process_request(self, request: Any, client_address: Any) -> None:

@@ -33,14 +33,15 @@ def same(a, b):
         np.testing.assert_array_equal(a[name], b[name])
 
 
-def test_an_unfelt_batch_differs_in_its_streams_alone(store):
-    felt, unfelt = (
-        next(iter(clip_batches(store, range(7), SMALL, batch_size=7, seed=3, felt=felt))) for felt in (True, False)
+def test_a_batch_without_touch_differs_in_its_streams_alone(store):
+    touched, untouched = (
+        next(iter(clip_batches(store, range(7), SMALL, batch_size=7, seed=3, with_touch=with_touch)))
+        for with_touch in (True, False)
     )
     for name in ("contact", "view", "view_mask", "label"):
-        np.testing.assert_array_equal(felt[name], unfelt[name])
-    assert unfelt["frames"].shape == (7, 4, 4, 1, 1, 3)
-    assert not any(unfelt[name].any() for name in ("frames", "force_n", "frame_index", "frame_mask", "stream_mask"))
+        np.testing.assert_array_equal(touched[name], untouched[name])
+    assert untouched["frames"].shape == (7, 4, 4, 1, 1, 3)
+    assert not any(untouched[name].any() for name in ("frames", "force_n", "frame_index", "frame_mask", "stream_mask"))
 
 
 class TestClipMemory:
@@ -51,11 +52,15 @@ class TestClipMemory:
         return list(clip_batches(store, range(7), SMALL, **options, memory=memory))
 
     @pytest.mark.parametrize("kept", [0, 2, 7, 14])
-    def test_batches_are_those_without_it_and_unfelt_clips_are_others(self, store, kept):
+    def test_batches_are_those_without_it_and_clips_without_touch_are_others(self, store, kept):
         one = sum(a.nbytes for a in self.feed(store, None, batch_size=1)[0].values())
         memory = ClipMemory(SMALL, kept * one)
-        for felt in (True, False, True, False):
-            for a, b in zip(self.feed(store, memory, felt=felt), self.feed(store, None, felt=felt), strict=True):
+        for with_touch in (True, False, True, False):
+            for a, b in zip(
+                self.feed(store, memory, with_touch=with_touch),
+                self.feed(store, None, with_touch=with_touch),
+                strict=True,
+            ):
                 same(a, b)
         assert min(kept, 7) * one <= memory.held_bytes <= kept * one
         random = ClipMemory(SMALL, 10**9)

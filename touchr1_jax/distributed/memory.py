@@ -134,20 +134,20 @@ def grpo_bytes(
       state, batch, frozen: its arguments.
       base: frozen parameters under low-rank adapters, which the state then holds.
     """
-    held = lambda tree: held_bytes(shape.mesh, tree)
+    local_bytes = lambda tree: held_bytes(shape.mesh, tree)
     layer = layer_weights(shape.decoder) // shape.mesh.tensor
     head = head_weights(shape.decoder) // shape.mesh.tensor
     half = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, jnp.bfloat16), state.params)
     rows = shape.mesh.data * shape.mesh.fsdp
     return {
-        "frozen base": held(base),
-        "parameters": held(state.params),
-        "optimizer": held(state.opt_state),
-        "reference": held(frozen.reference),
-        "noise bank": held({"noise": frozen.noise}),
+        "frozen base": local_bytes(base),
+        "parameters": local_bytes(state.params),
+        "optimizer": local_bytes(state.opt_state),
+        "reference": local_bytes(frozen.reference),
+        "noise bank": local_bytes({"noise": frozen.noise}),
         "batch": sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(batch)) // rows,
-        "gradients": 2 * held(state.params),
-        "parameters in bfloat16": held(half) * (1 + (state.reference is not None)) if shape.grpo.bfloat16 else 0,
+        "gradients": 2 * local_bytes(state.params),
+        "parameters in bfloat16": local_bytes(half) * (1 + (state.reference is not None)) if shape.grpo.bfloat16 else 0,
         "gathered weights": (2 * layer + _policies(shape) * head) * shape.number,
         "weights while sampling": _sampler_bytes(shape, (base, half if shape.grpo.bfloat16 else state.params)),
         "caches while sampling": cache_bytes(shape),

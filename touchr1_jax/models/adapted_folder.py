@@ -1,4 +1,4 @@
-"""A policy on released weights as a folder that describes itself, small beside the weights that it refers to.
+"""A policy on released weights as a folder that describes itself, small compared with the weights that it refers to.
 
 DIR/config.json                 sizes, sensors, prompt, frames that it reads, where the released weights are, checksums
 DIR/adapter_config.json         adapters in PEFT's format,
@@ -102,7 +102,7 @@ def read_adapted(
       folder: of the policy.
       weights: of the released model, where that is no longer where it was.
       found: the released model, where it was read already.
-      progress: told of the weights as `load_params` tells.
+      progress: called for the weights as in `load_params`.
 
     Raises:
       PolicyError: a damaged folder, one of another version, or released weights that are missing or others.
@@ -179,7 +179,7 @@ def _read_either(folder: Path, weights: Path | None) -> SavedPolicy:
 
 
 def export_merged(folder: Path, saved: SavedPolicy, dtype: jnp.dtype, progress: ReportBytes = SILENT) -> float:
-    """Publish the released folder with the adapters merged into its weights, and the touch encoder beside them.
+    """Publish the released folder with the adapters merged into its weights, and the touch encoder next to them.
 
     One tensor at a time is merged and written.  Of a base in four bits the released weights are read again, which is
     what adapters are usually merged into.
@@ -252,19 +252,19 @@ def read_touch(folder: Path, wanted: Params) -> Params:
     return fitting(folder, {name: read_tensor(entry) for name, entry in entries.items()}, wanted)
 
 
-def _same_lora(told: LoraConfig, lora: LoraConfig, adapters: Params) -> LoraConfig:
-    """The config of adapters, which both files and the tensors must tell alike.
+def _same_lora(stated: LoraConfig, lora: LoraConfig, adapters: Params) -> LoraConfig:
+    """The config of adapters, which both files and the tensors must agree on.
 
     Raises:
       ValueError: naming what differs.
     """
     layers = {tower: {path[-1] for path in by_layer(adapters) if path[0] == tower} for tower in adapters}
-    wanted = {tower: {*names} for tower, names in told.towers.items()}
-    if lora != dataclasses.replace(told, targets=lora.targets, vision_targets=lora.vision_targets):
-        raise ValueError(f"lora is {told} in {CONFIG_FILE} and {lora} in {PEFT_CONFIG}: must be the same")
+    wanted = {tower: {*names} for tower, names in stated.towers.items()}
+    if lora != dataclasses.replace(stated, targets=lora.targets, vision_targets=lora.vision_targets):
+        raise ValueError(f"lora is {stated} in {CONFIG_FILE} and {lora} in {PEFT_CONFIG}: must be the same")
     if layers != wanted:
         raise ValueError(f"adapters are of {layers}: must be of {wanted}")
-    return told
+    return stated
 
 
 def file_marks(directory: Path) -> dict[str, list[int]]:

@@ -31,14 +31,14 @@ class FrameDecoder(nn.Module):
         last: Float[Array, "n H W 3"],
         first: Float[Array, "n H W 3"],
         patches: Float[Array, "n patch D"],
-        told: Float[Array, "n E"],
+        condition: Float[Array, "n E"],
     ) -> Float[Array, "n H W 3"]:
         """Decode.
 
         Args:
           last, first: frames with pixels in [0, 1].
           patches: what the encoder says of each patch of the last step, row by row of a grid of the frame's shape.
-          told: what else is known, such as how far ahead to look.
+          condition: what else is known, such as how far ahead to look.
 
         Raises:
           ValueError: the cells do not fill the frame, or the patches no grid over it.
@@ -56,7 +56,7 @@ class FrameDecoder(nn.Module):
         x = nn.Dense(c.width, name="pixels")(seen)
         known = nn.Dense(c.width, name="patches")(patches).reshape(n, rows, columns, c.width)
         known = jnp.repeat(jnp.repeat(known, x.shape[1] // rows, 1), x.shape[2] // columns, 2)
-        x = nn.gelu(x + known + nn.Dense(c.width, name="told")(told)[:, None, None])
+        x = nn.gelu(x + known + nn.Dense(c.width, name="condition")(condition)[:, None, None])
         for i in range(c.num_layers):
             x = x + nn.gelu(nn.Conv(c.width, (3, 3), name=f"conv_{i}")(x))
         out = nn.Dense(3 * c.cell_px**2 + 1, kernel_init=nn.initializers.zeros, name="out")(x)

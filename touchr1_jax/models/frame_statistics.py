@@ -45,7 +45,7 @@ def frame_statistics(
 
 
 def scaled_statistics(frames: Real[Array, "*n F H W 3"], patch_px: int) -> Float[Array, "*n F patch statistic"]:
-    """Statistics of every patch beside those of all patches together, on a scale of about unit spread.
+    """Statistics of every patch and those of all patches together, on a scale of about unit spread.
 
     Raises:
       ValueError: as `frame_statistics`.
@@ -57,7 +57,7 @@ def scaled_statistics(frames: Real[Array, "*n F H W 3"], patch_px: int) -> Float
 
 
 def view_statistics(view: Real[Array, "*n H W 3"], cell_px: int) -> Float[Array, "*n cell statistic"]:
-    """Statistics of every cell of a picture beside those of all cells together, on a scale of about unit spread.
+    """Statistics of every cell of a picture and those of all cells together, on a scale of about unit spread.
 
     The mean, and the logarithm of the mean absolute gradient at pixel and at 4-pixel scale, of 3 channels each.
 
@@ -121,9 +121,9 @@ def _gradient(x: Float[Array, "*n H W 3"], rows: int, columns: int) -> Float[Arr
     *lead, h, w, c = x.shape
     lines = x.reshape(*lead, h // rows, rows, w * c)
     vertical = jnp.abs(jnp.diff(lines, axis=-2)).mean(-2).reshape(*lead, h // rows, w // columns, columns, c)
-    beside = jnp.abs(lines[..., c:] - lines[..., :-c]).mean(-2)
-    beside = jnp.pad(beside, [(0, 0)] * (beside.ndim - 1) + [(0, c)])
-    horizontal = beside.reshape(*lead, h // rows, w // columns, columns, c)[..., : columns - 1, :]
+    sideways = jnp.abs(lines[..., c:] - lines[..., :-c]).mean(-2)
+    sideways = jnp.pad(sideways, [(0, 0)] * (sideways.ndim - 1) + [(0, c)])
+    horizontal = sideways.reshape(*lead, h // rows, w // columns, columns, c)[..., : columns - 1, :]
     return (vertical.mean(-2) + horizontal.mean(-2)).reshape(*lead, -1, c)
 
 

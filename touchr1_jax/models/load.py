@@ -36,7 +36,7 @@ TOKENIZER_FILE = "tokenizer.json"
 
 
 class WeightsError(ValueError):
-    """Released weights, or a file beside them, that cannot be used; the message says which, why, and what to do."""
+    """Released weights, or a file next to them, that cannot be used; the message says which, why, and what to do."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -63,7 +63,7 @@ def load_checkpoint(
       directory: `config.json`, `tokenizer.json`, `preprocessor_config.json` or `processor_config.json`, a chat
         template, and the weights as `load_params` reads them.
       dtype: type of all parameters.
-      progress: told of the weights as `load_params` tells.
+      progress: called for the weights as in `load_params`.
       four_bits: as in `load_params`; for a base of adapters.
 
     Raises:

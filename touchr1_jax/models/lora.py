@@ -1,4 +1,4 @@
-"""Low-rank adapters as a function of parameters: a frozen base, and a small tree beside it that is trained.
+"""Low-rank adapters as a function of parameters: a frozen base, and a small tree added to it that is trained.
 
     y = x W + s (x A) B,   W [in, out] frozen, A [in, r], B [r, out] trained, B = 0 at first
 

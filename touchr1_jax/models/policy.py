@@ -269,8 +269,8 @@ def with_features(x: Float[Array, "L D"], features: Features, slots: Slots) -> t
 
 def prompt_mask(features: Features, mask: Bool[Array, "L"], slots: Slots) -> Bool[Array, "L"]:
     """Which prompt tokens exist: real text, names of present streams, tokens of their recorded steps, any view."""
-    felt = features.stream_mask[:, None] & (features.touch_time >= 0)
-    mask = jnp.asarray(mask).at[slots.touch].set(felt)
+    exists = features.stream_mask[:, None] & (features.touch_time >= 0)
+    mask = jnp.asarray(mask).at[slots.touch].set(exists)
     mask = mask.at[slots.view].set(features.view_mask)
     named = jnp.append(features.stream_mask, features.view_mask)[np.maximum(slots.stream_text, 0)]
     mask = mask & jnp.where(slots.stream_text >= 0, named, True)

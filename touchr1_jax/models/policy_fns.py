@@ -31,8 +31,8 @@ class PolicyFns:
       pad_id: id that follows the end.
       cache_dtype: type of keys and values, that of the decoder's parameters.
       lora: which layers have adapters where parameters hold any, and their scale.
-      base: frozen parameters, beside those that are an argument.  One of gigabytes must reach a compiled step as an
-        argument and not as a constant: build the step inside the compiled function, as `over_base` does.
+      base: frozen parameters, in addition to those that are an argument.  A base of gigabytes must be an argument of a
+        compiled step and not a constant: build the step inside the compiled function, as `over_base` does.
     """
 
     module: Policy

@@ -1,4 +1,4 @@
-"""No more than a scene needs: which frames and which patches of a touch are worth reading, told by what changes.
+"""No more than a scene needs: which frames and which patches of a touch are worth reading, found by what changes.
 
 Everything is measured against the first frame of a stream, which shows the untouched or least pressed gel, on every
 `STRIDE_PX`-th pixel of the bytes: the choice costs less than a hundredth of what it saves.

@@ -65,7 +65,7 @@ class PolicyInput:
     Attributes:
       rejected: names of the quality flags whose frames are left out.
       choose: rule by which the frames of a sequence are chosen (`sensors_io.selection.choose_frames`).
-      show: camera pictures, or the fields beside them, as images (`sensors_io.selection.field_images`).
+      show: camera pictures, or their fields, as images (`sensors_io.selection.field_images`).
       force, view: whether a force was measured, and whether objects had a picture.
     """
 
@@ -113,7 +113,7 @@ def save_policy(folder: Path, saved: SavedPolicy, *, precision: Precision = "flo
       card: the model card; by default a table of `notes`.
 
     Raises:
-      PolicyError: the folder exists and holds something else, be it beside a policy; a parameter is beyond the range
+      PolicyError: the folder exists and holds something else, even next to a policy; a parameter is beyond the range
         of that precision.
     """
     if folder.exists() and format_of(folder) != FORMAT and (not folder.is_dir() or any(folder.iterdir())):
@@ -131,7 +131,7 @@ def published(folder: Path, parts: Collection[str] = ()) -> Iterator[Path]:
     """A new folder that takes the place of `folder` if the block ends without an error, and else vanishes.
 
     A killed process leaves the old one or the new one; where the file system cannot exchange two folders, the old one
-    may lie beside it under a hidden name, which `read_sealed` tells.  A link is followed.
+    may be in the same folder under a hidden name, which `read_sealed` tells.  A link is followed.
 
     Args:
       folder: where; only `parts` of what is there, by their names, may be replaced.
@@ -142,8 +142,8 @@ def published(folder: Path, parts: Collection[str] = ()) -> Iterator[Path]:
     folder = Path(os.path.realpath(folder))  # `resolve` raises RuntimeError for links in a circle
     others = sorted(path.name for path in folder.glob("*") if path.name not in parts)
     if others or folder.is_file():
-        held = f"it also holds {', '.join(others[:3])}, which would be lost" if others else "a file"
-        raise PolicyError(f"folder is {folder}: {held}; move it away, or choose a new one")
+        found = f"it also holds {', '.join(others[:3])}, which would be lost" if others else "a file"
+        raise PolicyError(f"folder is {folder}: {found}; move it away, or choose a new one")
     unfinished, old = (folder.with_name(f".{folder.name}.{os.getpid()}{end}") for end in ("", ".old"))
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)
@@ -294,7 +294,7 @@ def require_files(folder: Path, digests: Mapping[str, str], names: Collection[st
 
 
 def read_sealed(folder: Path, wanted: str, newest: int) -> dict[str, Any]:
-    """Contents of a `config.json` that `seal` wrote, held against its checksum.
+    """Contents of a `config.json` that `seal` wrote, checked against its checksum.
 
     Args:
       folder: of the policy.

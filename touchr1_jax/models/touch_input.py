@@ -44,10 +44,10 @@ def clip_arrays(touch: TouchInput, saved: SavedPolicy) -> dict[str, np.ndarray]:
             raise QuestionError(
                 f"{field} is {type(given).__name__}: must name its sensor, as in {{{sensors[0]!r}: …}}; name it"
             )
-    unfelt = sorted(map(str, (touch.force_n.keys() | touch.index.keys()) - touch.frames.keys()))
-    if unfelt:
+    without_frames = sorted(map(str, (touch.force_n.keys() | touch.index.keys()) - touch.frames.keys()))
+    if without_frames:
         raise QuestionError(
-            f"force_n and index are of {', '.join(unfelt)}: must be of sensors with frames; rename them"
+            f"force_n and index are of {', '.join(without_frames)}: must be of sensors with frames; rename them"
         )
     unknown = sorted(map(str, touch.frames.keys() - {*sensors}))
     if unknown or not touch.frames:

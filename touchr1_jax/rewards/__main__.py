@@ -235,13 +235,13 @@ def terms_table(
         scored = jax.vmap(of_rollout, in_axes=(0, 0, None), axis_name=GROUP)(tokens[None], alone, target)
         return jax.tree.map(lambda x: x[0], scored)
 
-    for said, target in targets:
+    for slot, target in targets:
         total, parts, terms = score(target)
         for name, weight in weights.items():
             value, applies = terms[name]
             shown = f"{float(value):.3f}" if applies else NOT_DEFINED
-            table.add_row(said, name, shown, f"{weight:g}", f"{float(parts[name]):+.3f}")
-            said = ""
+            table.add_row(slot, name, shown, f"{weight:g}", f"{float(parts[name]):+.3f}")
+            slot = ""
         table.add_row("", "total", "", "", f"{float(total):+.3f}", style="bold", end_section=True)
     return table
 

@@ -81,5 +81,5 @@ def _spreads(n: int) -> Int[np.ndarray, "m 3"]:
 
 def _probability(count: Int[np.ndarray, "m 3"], p: Float[np.ndarray, "3"]) -> Float[np.ndarray, "m"]:
     """Multinomial probability of the counts."""
-    ways = np.array([factorial(sum(c)) / np.prod([factorial(x) for x in c]) for c in count.tolist()])
-    return ways * np.prod(p**count, -1)
+    orders = np.array([factorial(sum(c)) / np.prod([factorial(x) for x in c]) for c in count.tolist()])
+    return orders * np.prod(p**count, -1)

@@ -103,13 +103,13 @@ class TouchBank:
     def step(self, state: TouchCase, action: Int[Array, ""]) -> tuple[TouchCase, Outcome]:
         """Gather the contact of a choice; an unavailable or not offered contact returns no token and no harm."""
         at = (state.object, action)
-        felt = self.available[at] & state.offered[action]
-        tokens = jnp.where(felt, self.tokens[at], 0.0)
+        available = self.available[at] & state.offered[action]
+        tokens = jnp.where(available, self.tokens[at], 0.0)
         outcome = Outcome(
             tokens=tokens,
-            exists=jnp.broadcast_to(felt, tokens.shape[:1]),
+            exists=jnp.broadcast_to(available, tokens.shape[:1]),
             seconds=self.seconds[at].astype(jnp.float32),
-            harm=jnp.where(felt, self.harm[at].astype(jnp.float32), 0.0),
+            harm=jnp.where(available, self.harm[at].astype(jnp.float32), 0.0),
         )
         return state, outcome
 

@@ -133,11 +133,15 @@ def read_completions(answer: Any, config: GRPOConfig, fns: PolicyFns) -> Rollout
     for choice in choices:
         i, where = int(choice["index"]), f"choices[{choice['index']}]"
         ids = _token_ids(choice.get("token_ids"), f"{where}.token_ids", length, fns)
-        said = choice.get("logprobs")
-        said = said if isinstance(said, dict) else {}
+        log_probs = choice.get("logprobs")
+        log_probs = log_probs if isinstance(log_probs, dict) else {}
         tokens[i, : len(ids)], mask[i, : len(ids)] = ids, True
-        log_prob[i, : len(ids)] = _log_probs(said.get("token_logprobs"), f"{where}.logprobs.token_logprobs", len(ids))
-        for t, best in enumerate(_heads(said.get("top_logprobs"), f"{where}.logprobs.top_logprobs", len(ids), most)):
+        log_prob[i, : len(ids)] = _log_probs(
+            log_probs.get("token_logprobs"), f"{where}.logprobs.token_logprobs", len(ids)
+        )
+        for t, best in enumerate(
+            _heads(log_probs.get("top_logprobs"), f"{where}.logprobs.top_logprobs", len(ids), most)
+        ):
             kept = sorted(best.items(), key=lambda item: -item[1])[:most]
             head_ids[i, :, t] = [_id(name, where, fns) for name, _ in kept]
             head_log_prob[i, :, t] = [value for _, value in kept]

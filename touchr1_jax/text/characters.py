@@ -12,7 +12,7 @@ import unicodedata
 import numpy as np
 
 WORD, BREAK, BEGUN = 128, 129, 130
-"""Units beside the ASCII characters: another word character, one that ends a word, the first bytes of either."""
+"""Units after the ASCII characters: another word character, one that ends a word, the first bytes of either."""
 
 NOTHING, A_WORD, A_BREAK, BOTH = range(4)
 """Cases of the first bytes of a token: they complete no character, a word character, one that ends a word, or both."""

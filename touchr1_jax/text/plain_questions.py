@@ -47,12 +47,12 @@ def read_question(question: str, attributes: Mapping[str, Sequence[str]]) -> Ask
       QuestionError: the question names none of them, several, or compares by both ends of one.
     """
     text = question.lower()
-    said = set(re.findall(r"[a-z]+", text))
+    words = set(re.findall(r"[a-z]+", text))
     found = {}
     for name, levels in attributes.items():
         up, down = {name, *MORE.get(name, ()), *levels} - {*_VAGUE}, {*LESS.get(name, ())}
-        if said & (up | down):
-            found[name] = -1 if said & down else 1
+        if words & (up | down):
+            found[name] = -1 if words & down else 1
     if len(found) != 1:
         named = f"names {' and '.join(found)}: ask for one at a time" if found else "names no attribute"
         raise QuestionError(
@@ -68,6 +68,6 @@ def read_question(question: str, attributes: Mapping[str, Sequence[str]]) -> Ask
         *MORE.get(name, ()),
         *LESS.get(name, ()),
     }
-    if comparing and said & {*MORE.get(name, ())} and said & {*LESS.get(name, ())}:
+    if comparing and words & {*MORE.get(name, ())} and words & {*LESS.get(name, ())}:
         raise QuestionError(f"question is {question!r}: it names both ends of {name}; ask as in 'Which is softer?'")
-    return AskedAttribute(name=name, sign=-sign if said & {"less", "least"} else sign, compares=bool(comparing))
+    return AskedAttribute(name=name, sign=-sign if words & {"less", "least"} else sign, compares=bool(comparing))

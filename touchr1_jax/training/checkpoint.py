@@ -161,10 +161,10 @@ class Checkpoints:
         state = jax.tree.map(jnp.copy, state)
         if score is not None and self._is_best(score):
             self._best = step, score
-        held = {"data": data, "digests": _digests(state)} | ({"of": self._label(step)} if self._of else {})
-        held |= {"best": self._best} if self._better else {}
+        kept = {"data": data, "digests": _digests(state)} | ({"of": self._label(step)} if self._of else {})
+        kept |= {"best": self._best} if self._better else {}
         args = ocp.args.Composite(
-            state=ocp.args.StandardSave(state), data=ocp.args.JsonSave(held | {"crc32": _crc32(held)})
+            state=ocp.args.StandardSave(state), data=ocp.args.JsonSave(kept | {"crc32": _crc32(kept)})
         )
         others = threading.current_thread() is not threading.main_thread()
         self._before_save()
@@ -268,9 +268,9 @@ class Checkpoints:
             raise DamagedCheckpointError(f"{where}: the checksum of {', '.join(changed)} does not hold")
         try:
             found = self._restored(step, like)
-            held = {name: value for name, value in found.data.items() if name != "crc32"}
-            data, digests = held["data"], held["digests"]
-            intact = found.data["crc32"] == _crc32(held)
+            kept = {name: value for name, value in found.data.items() if name != "crc32"}
+            data, digests = kept["data"], kept["digests"]
+            intact = found.data["crc32"] == _crc32(kept)
         except _FAILURES as error:
             if self._readable(step):
                 raise CheckpointError(
@@ -281,12 +281,12 @@ class Checkpoints:
         if not intact:
             raise DamagedCheckpointError(f"{where}: the checksum of its data does not hold")
         label = self._label(step)  # in a checkpoint of an earlier version there is none
-        if self._of and held.get("of", label) != label:
-            raise DamagedCheckpointError(f"{where} is of {held['of']}: must be of {label}")
+        if self._of and kept.get("of", label) != label:
+            raise DamagedCheckpointError(f"{where} is of {kept['of']}: must be of {label}")
         changed = [name for name, value in _digests(found.state).items() if digests.get(name) != value]
         if changed:
             raise DamagedCheckpointError(f"{where}: the digest of {', '.join(changed)} does not hold")
-        best = held.get("best") or self._ranked()
+        best = kept.get("best") or self._ranked()
         return Restored(step, found.state, data, None if best is None else (best[0], best[1]))
 
     def _label(self, step: int) -> str:

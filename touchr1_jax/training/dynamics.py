@@ -161,8 +161,8 @@ def predict_next(
     """Predicted latents of the steps 1 … T − 1 from the shown streams."""
     predictor = LatentPredictor(config.predictor, latent.shape[1])
     visible = steps.exists & shown[..., None]
-    told = (steps.index[:, :, 1:], steps.force_n[:, :, 1:])
-    out: Any = predictor.apply({"params": params}, latent[:, :, :-1], visible[:, :, :-1], *told)
+    known = (steps.index[:, :, 1:], steps.force_n[:, :, 1:])
+    out: Any = predictor.apply({"params": params}, latent[:, :, :-1], visible[:, :, :-1], *known)
     return out
 
 

@@ -241,13 +241,13 @@ def verified_answer(
     if np.any(label[asked] < 0):
         return np.full(length, policy.tokenizer.pad_id, np.int32), np.zeros(length, bool)
     lowest = np.where(np.isneginf(log_prob), np.inf, log_prob).min(-1)  # of the levels that an attribute has
-    told = streams[:, None] & (log_prob.max(-1) > lowest)
-    together = np.where(told.any(0), np.where(told[..., None], log_prob, 0).sum(0).argmax(-1), label)
+    informed = streams[:, None] & (log_prob.max(-1) > lowest)
+    together = np.where(informed.any(0), np.where(informed[..., None], log_prob, 0).sum(0).argmax(-1), label)
     text = answer_text(
         policy.language,
         asked=asked,
         streams=streams,
-        perceive=np.where(told, log_prob.argmax(-1), together),
+        perceive=np.where(informed, log_prob.argmax(-1), together),
         compare=together,
         conclude=label,
     )

@@ -82,12 +82,12 @@ def existing_tokens(
     c = policy.config.tactile
     frames = np.asarray(touch.frame_mask)
     steps = frames.reshape(*frames.shape[:-1], -1, c.frames_per_step).any(-1).repeat(c.tokens_per_step, -1)
-    felt = np.asarray(touch.stream_mask)[:, None] & streams
+    shown = np.asarray(touch.stream_mask)[:, None] & streams
     prompt = np.array(mask)
-    prompt[..., slots.touch] = felt[..., None] & steps[:, None]
+    prompt[..., slots.touch] = shown[..., None] & steps[:, None]
     prompt[..., slots.view] = touch.view_mask[:, None, None]
-    viewed = np.broadcast_to(touch.view_mask[:, None, None], (*felt.shape[:2], 1))
-    named = np.concatenate([felt, viewed], -1)[..., np.maximum(slots.stream_text, 0)]
+    viewed = np.broadcast_to(touch.view_mask[:, None, None], (*shown.shape[:2], 1))
+    named = np.concatenate([shown, viewed], -1)[..., np.maximum(slots.stream_text, 0)]
     prompt &= np.where(slots.stream_text >= 0, named, True)
     if slots.step_text is not None:
         prompt &= np.where(slots.step_text >= 0, prompt[..., np.maximum(slots.step_text, 0)], True)
@@ -192,7 +192,7 @@ def padded_tokens(
       ids, mask, streams, tokens: as in `SFTBatch`.
       contacts: of a group, which are neighbours.
     """
-    felt, t = features.touch.shape[-3] * features.touch.shape[-2], tokens.shape[-1]
+    touch_tokens, t = features.touch.shape[-3] * features.touch.shape[-2], tokens.shape[-1]
 
     def positions(seen: Features, mask: Array, streams: Array) -> Array:
         seen = dataclasses.replace(seen, stream_mask=seen.stream_mask & streams)
@@ -202,9 +202,9 @@ def padded_tokens(
         return jnp.concatenate([prompt, jnp.broadcast_to(after, (3, t))], -1)
 
     place = np.full(ids.shape[-1] + t, -1)
-    place[slots.touch] = np.arange(felt).reshape(slots.touch.shape)
-    place[slots.view] = felt + np.arange(len(slots.view))
-    before = (felt + len(slots.view)) * (jnp.arange(len(ids)) % contacts)
+    place[slots.touch] = np.arange(touch_tokens).reshape(slots.touch.shape)
+    place[slots.view] = touch_tokens + np.arange(len(slots.view))
+    before = (touch_tokens + len(slots.view)) * (jnp.arange(len(ids)) % contacts)
     feature = jnp.where(place >= 0, before[:, None, None] + place, -1)
     return Tokens(
         ids=jnp.concatenate([ids, tokens], -1),

@@ -124,8 +124,8 @@ class RolloutServer:
             raise ValueError(f"mesh is {devices.shape}: must be one device {needs}; leave it, or rollouts.url, out")
         answer = self._send(MODELS)
         if not isinstance(answer, dict) or not isinstance(answer.get("data"), list):
-            told = str(answer)[:100]
-            raise RolloutError(f"{self._url}{MODELS} answers {told}: must be a list of models; correct rollouts.url")
+            shown = str(answer)[:100]
+            raise RolloutError(f"{self._url}{MODELS} answers {shown}: must be a list of models; correct rollouts.url")
 
     def before(
         self, step: Step, policy: ReleasedPolicy, table: Float[Array, "V D"], config: GRPOConfig, devices: SingleDevice
@@ -211,7 +211,7 @@ class RolloutServer:
                     content = answer.read()
                 return json.loads(content) if path in (MODELS, COMPLETE) else None
             except urllib.error.HTTPError as error:
-                problem = f"status {error.code} ({_said(error)})"
+                problem = f"status {error.code} ({_message(error)})"
                 if path == LOAD and attempt and "already" in problem:
                     return None  # the first answer was lost
                 if error.code < 500 and error.code not in TRANSIENT:
@@ -224,7 +224,7 @@ class RolloutServer:
         )
 
 
-def _said(error: urllib.error.HTTPError) -> str:
+def _message(error: urllib.error.HTTPError) -> str:
     """Beginning of the text of a refusal."""
     try:
         return error.read(300).decode("utf-8", errors="replace").strip()

@@ -68,14 +68,14 @@ class VideoPredictor(nn.Module):
         encoded = encoder.encode(batch.frames, batch.force_n, batch.frame_index, past, sensors)
         patches = jnp.take_along_axis(encoded.patches, asked.last[..., None, None, None], 2)[:, :, 0]
         pooled = jnp.take_along_axis(encoded.pooled, asked.last[..., None, None, None], 2)[:, :, 0]
-        told = [pooled.reshape(p, s, -1), jax.nn.one_hot(asked.skip, len(c.skips)), jax.nn.one_hot(sensors, s)]
+        known = [pooled.reshape(p, s, -1), jax.nn.one_hot(asked.skip, len(c.skips)), jax.nn.one_hot(sensors, s)]
         if c.vision is not None:
             view = c.vision.tower(c.encoder.width)(batch.view).reshape(p, 1, -1) * batch.view_mask[:, None, None]
-            told.append(jnp.broadcast_to(view, (p, s, view.shape[-1])))
+            known.append(jnp.broadcast_to(view, (p, s, view.shape[-1])))
         last, first = frame_at(batch, asked.last), unit_pixels(batch.frames[:, :, 0])
         flat = lambda x: x.reshape(p * s, *x.shape[2:])
         decoder = FrameDecoder(c.decoder, name="decoder")
-        frames = decoder(flat(last), flat(first), flat(patches), flat(jnp.concatenate(told, -1)))
+        frames = decoder(flat(last), flat(first), flat(patches), flat(jnp.concatenate(known, -1)))
         return frames.reshape(last.shape)
 
 

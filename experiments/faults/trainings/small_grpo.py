@@ -72,10 +72,10 @@ def run(config: ReinforcingConfig, context: Context) -> Results:
     noise = drawn_features(rng, NOISE).touch
     frozen = FrozenInputs(reference=decoder, noise=jnp.asarray(noise))
     feed = drawn_questions(policy, rng, CONTACTS, config.grpo.drawn)
-    held = next(drawn_questions(policy, rng, HELD_OUT, HELD_OUT))
+    batch = next(drawn_questions(policy, rng, HELD_OUT, HELD_OUT))
     begin = jax.jit(lambda params, key: start_state(params, optimizer, key, config.grpo))  # one program, not forty
     state = begin(decoder, jax.random.key(0))
-    judge = jax.jit(lambda params: certainty(policy, params, held))
+    judge = jax.jit(lambda params: certainty(policy, params, batch))
     run_loop(
         lambda s, batch: step(s, batch, frozen, fns.base),
         state,
@@ -89,9 +89,9 @@ def run(config: ReinforcingConfig, context: Context) -> Results:
     return Results(verdict=("It came to its end.",))
 
 
-def certainty(policy: TouchPolicy, params: Params, held: GRPOBatch) -> jax.Array:
+def certainty(policy: TouchPolicy, params: Params, batch: GRPOBatch) -> jax.Array:
     """Mean largest log-probability of the first word about held-out contacts: cheap, and any score will do."""
-    first = jax.vmap(lambda f, i, m: policy.fns.prefill(params, f, i, m)[0])(held.features, held.ids, held.mask)
+    first = jax.vmap(lambda f, i, m: policy.fns.prefill(params, f, i, m)[0])(batch.features, batch.ids, batch.mask)
     return jnp.mean(jnp.max(jax.nn.log_softmax(first), -1))
 
 

@@ -51,7 +51,7 @@ def clips(data):
 def answers(policy, data, evidence):
     def feed(**changes):
         order = {"batch_size": 3, "seed": 1} | {k: v for k, v in changes.items() if k in ("seed", "own")}
-        clips = data.batches(data.parts["sft"], felt=not changes.get("blind"), **order)
+        clips = data.batches(data.parts["sft"], with_touch=not changes.get("blind"), **order)
         return AnswerFeed(policy, clips, evidence, **{"questions": 3, **order, **changes})
 
     return feed

@@ -62,7 +62,7 @@ def test_a_lattice_is_followed_though_a_start_a_pitch_away_explains_more_dots(tr
 
 def test_the_border_of_a_set_of_points_is_outside_it():
     line = Neighbours(np.column_stack([np.arange(5.0), np.zeros(5)]))
-    assert line.beside(np.array([False, True, True, False, False])).tolist() == [True, False, False, True, False]
+    assert line.adjacent(np.array([False, True, True, False, False])).tolist() == [True, False, False, True, False]
 
 
 def test_lost_dots_are_flagged_placed_and_found_again(tracker):

@@ -98,7 +98,7 @@ def test_the_background_of_a_camera_is_refreshed_where_nothing_touches(live):
 def test_it_runs_beside_and_stops_with_its_device(live):
     device = Watched("tac3d", {"depth_mm": np.zeros((4, 4))})
     presenter = Presenter([Channel(device)], None, live)
-    with presenter.beside():
+    with presenter.in_thread():
         deadline = time.monotonic() + 5
         while live.shown.version == 0 and time.monotonic() < deadline:
             time.sleep(0.01)

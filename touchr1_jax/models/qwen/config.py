@@ -56,7 +56,7 @@ class TowerConfig:
 
     @property
     def levels(self) -> int:
-        """K, layers of the tower whose features reach the decoder beside those of the last."""
+        """K, layers of the tower whose features reach the decoder in addition to those of the last."""
         return 0
 
     @property
@@ -136,7 +136,7 @@ class Qwen3VisionConfig(TowerConfig):
 
     @property
     def levels(self) -> int:
-        """K, layers of the tower whose features reach the decoder beside those of the last."""
+        """K, layers of the tower whose features reach the decoder in addition to those of the last."""
         return len(self.deepstack_layers)
 
     @property

@@ -139,7 +139,7 @@ def _decoder(text: _Fields, kind: type[DecoderConfig], *, tied: bool) -> Decoder
 
 
 def _rope(text: _Fields, head_dim: int, interleaved: bool) -> tuple[float, tuple[int, int, int]]:
-    """Base and sections of the rotary positions: `rope_theta` beside `rope_scaling`, or both in `rope_parameters`."""
+    """Base and sections of the rotary positions: `rope_theta` next to `rope_scaling`, or both in `rope_parameters`."""
     rope = text.part("rope_parameters" if "rope_parameters" in text.found else "rope_scaling")
     kinds = [rope.found[k] for k in ("type", "rope_type") if k in rope.found]
     if not all(kind in ("mrope", "default") for kind in kinds):

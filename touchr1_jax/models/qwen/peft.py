@@ -1,4 +1,4 @@
-"""Adapters in the format of Hugging Face's PEFT: `adapter_config.json` beside `adapter_model.safetensors`."""
+"""Adapters in the format of Hugging Face's PEFT: `adapter_config.json` and `adapter_model.safetensors`."""
 
 import json
 import re
@@ -94,9 +94,9 @@ def load_adapters(folder: Path, config: QwenConfig) -> tuple[Adapters, LoraConfi
         factors: list[Any] = []
         for key, shape in zip(keys, ((lora.rank, inp), (out, lora.rank)), strict=True):
             if key not in entries or entries[key].shape != shape or entries[key].dtype not in DTYPES:
-                told = f"{entries[key].dtype} {entries[key].shape}" if key in entries else "missing"
+                found = f"{entries[key].dtype} {entries[key].shape}" if key in entries else "missing"
                 raise ValueError(
-                    f"{folder / PEFT_WEIGHTS}: {key} is {told}: must be {shape} of rank {lora.rank}, of real numbers"
+                    f"{folder / PEFT_WEIGHTS}: {key} is {found}: must be {shape} of rank {lora.rank}, of real numbers"
                 )
             factors.append(read_tensor(entries.pop(key)).astype(np.float32).T)
             if not np.isfinite(factors[-1]).all():
@@ -123,8 +123,8 @@ def read_lora(fields: Mapping[str, Any], where: Path) -> LoraConfig:
     alpha: Any = fields.get("lora_alpha")
     stabilised = fields.get("use_rslora", False)
     if type(rank) is not int or rank < 1 or type(alpha) not in (int, float) or not 0 < alpha <= MOST_ALPHA:
-        told = f"r is {rank!r} and lora_alpha {str(alpha)[:20]}"
-        raise ValueError(f"{where}: {told}: must be a whole number ≥ 1 and a number above 0; correct them")
+        found = f"r is {rank!r} and lora_alpha {str(alpha)[:20]}"
+        raise ValueError(f"{where}: {found}: must be a whole number ≥ 1 and a number above 0; correct them")
     if type(stabilised) is not bool:
         raise ValueError(f"{where}: use_rslora is {stabilised!r}: must be true or false; correct it")
     return LoraConfig(rank=rank, alpha=float(alpha), rank_stabilised=stabilised)

@@ -111,7 +111,7 @@ def init_on_pretrained(
     slots: Slots,
     pretrained: Params,
 ) -> Params:
-    """Parameters of a policy on a pretrained model: its own vision tower and decoder, beside them fresh ones, float32.
+    """Parameters of a policy on a pretrained model: its own vision tower and decoder, and fresh ones, float32.
 
     Vision tower and decoder are never initialised: memory is what `pretrained` has already.
 

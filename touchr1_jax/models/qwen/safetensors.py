@@ -138,7 +138,7 @@ def write_file(
 
 
 def _entry(path: Path, name: str, found: Any, body: int, size: int) -> TensorEntry:
-    """One entry of a header whose tensors start at byte `body`, held against its own shape and the file."""
+    """One entry of a header whose tensors start at byte `body`, checked against its own shape and the file."""
     fields = {"dtype", "shape", "data_offsets"} - {*(found if isinstance(found, dict) else ())}
     if fields:
         raise ValueError(f"{path}: {name} lacks {', '.join(sorted(fields))}; fetch the file again")

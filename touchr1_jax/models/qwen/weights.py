@@ -46,8 +46,8 @@ def load_params(
 ) -> Params:
     """Parameters of `QwenVL` from the safetensors files of a directory.
 
-    One tensor at a time is read, cast and laid out, the largest first, while little else is held: the host never holds
-    more than the parameters placed on it and two copies of a small one.  A tied checkpoint may also store the head.
+    One tensor at a time is read, cast and laid out, the largest first, while memory is free: the host never holds more
+    than the parameters placed on it and two copies of a small one.  A tied checkpoint may also store the head.
 
     Args:
       directory: `model.safetensors`, or `model.safetensors.index.json` with its shards.
@@ -244,10 +244,10 @@ def _raw_tensors(directory: Path) -> dict[str, safetensors.TensorEntry]:
         place = dict(json.loads(index.read_text(encoding="utf-8"))["weight_map"])
         odd = [shard for shard in place.values() if not isinstance(shard, str) or Path(shard).name != shard]
         if odd:
-            raise ValueError(f"{odd[0]!r} must be the name of a file beside it")
+            raise ValueError(f"{odd[0]!r} must be the name of a file in its folder")
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        told = f"{type(error).__name__}: {error}"  # its `repr` may hold the whole file
-        raise ValueError(f"{index} is no index: must be JSON with a weight_map ({told}); fetch it again") from error
+        reason = f"{type(error).__name__}: {error}"  # its `repr` may hold the whole file
+        raise ValueError(f"{index} is no index: must be JSON with a weight_map ({reason}); fetch it again") from error
     entries: dict[str, safetensors.TensorEntry] = {}
     for shard in sorted(set(place.values())):
         if not (directory / shard).is_file():

@@ -1,8 +1,9 @@
-"""Fields beside the pictures of records: what is written, what is refused, and that a killed extraction goes on."""
+"""Records with pictures and extracted fields: what is written, what is refused, how a killed extraction goes on."""
 
 import dataclasses
 import functools
 import pathlib
+import shutil
 
 import cv2
 import numpy as np
@@ -11,9 +12,9 @@ import pytest
 from sensors_io.codec import encode_sequence
 from sensors_io.contents import put_rest_pictures, rest_pictures
 from sensors_io.errors import UserError
-from sensors_io.fields import beside
-from sensors_io.fields.beside import FieldsJob, fields_beside
+from sensors_io.fields import extracted_records
 from sensors_io.fields.extract import ExtractConfig, Extractor
+from sensors_io.fields.extracted_records import FieldsJob, write_extracted
 from sensors_io.fields.recorded import RecordedGels, RestGel, recorded_fields
 from sensors_io.fields.sources import read_pictures
 from sensors_io.fields.types import CalibrationError
@@ -80,7 +81,7 @@ def test_gaps_are_of_the_periods_that_the_config_says(tmp_path, periods, late):
 def test_fields_lie_beside_the_pictures(tmp_path):
     records, out = written(tmp_path / "records"), tmp_path / "fields"
     put_rest_pictures(records, {"rest.png": b"a picture"})
-    fields_beside(job(records, rows=SHAPE[0] // 2), out)
+    write_extracted(job(records, rows=SHAPE[0] // 2), out)
     before, after = RecordStore(records), RecordStore(out)
     assert after.contacts == before.contacts
     assert rest_pictures(out) == {"rest.png": b"a picture"}
@@ -89,7 +90,7 @@ def test_fields_lie_beside_the_pictures(tmp_path):
     assert encode_sequence(old["xense"]) == encode_sequence(new["xense"])
     np.testing.assert_array_equal(old["gelsight_mini"].frames, new["gelsight_mini"].frames)
     mini = new["gelsight_mini"]
-    fields_beside(job(records, rows=10**6), tmp_path / "large")  # never enlarged
+    write_extracted(job(records, rows=10**6), tmp_path / "large")  # never enlarged
     assert RecordStore(tmp_path / "large").contact(1)["gelsight_mini"].depth_mm.shape[1:] == SHAPE
     whole = Extractor(bare(), 0.1, CALIBRATION).extract(mini.frames).depth_mm
     halved = np.stack([cv2.resize(d, (SHAPE[1] // 2, SHAPE[0] // 2), interpolation=cv2.INTER_AREA) for d in whole])
@@ -104,14 +105,14 @@ def test_a_gel_with_markers_gives_all_fields_and_an_estimated_force(tmp_path):
     records = written(tmp_path / "records", 1, frames=frames)
     made = dataclasses.replace(CALIBRATION, background=dotted())
     coarse = {"gel": RestGel(rest_frames=1), "calibration": made, "config": ExtractConfig(nodes=6)}
-    fields_beside(job(records, **coarse), tmp_path / "out")
+    write_extracted(job(records, **coarse), tmp_path / "out")
     mini = RecordStore(tmp_path / "out").contact(0)["gelsight_mini"]
     assert mini.depth_mm.shape == (3, *SHAPE)
     assert mini.deformation_mm.shape == mini.shear_mm.shape == (3, *SHAPE, 2)
     assert np.median(mini.deformation_mm[2, ..., 0]) == pytest.approx(0.2, abs=0.02)
     assert (mini.force_n.shape, mini.camera["force_n"]) == ((3, 3), "estimated from the fields")
     measured = written(tmp_path / "measured", 1, frames=frames, force_n=np.full((3, 3), -1.5, np.float32))
-    fields_beside(job(measured, **coarse), tmp_path / "kept")
+    write_extracted(job(measured, **coarse), tmp_path / "kept")
     assert (RecordStore(tmp_path / "kept").contact(0)["gelsight_mini"].force_n == -1.5).all()
 
 
@@ -120,12 +121,22 @@ def test_the_gel_at_rest_of_other_records_stays(tmp_path):
     records, other = written(tmp_path / "records", 1), written(tmp_path / "other", 1)
     for path, content in ((records, b"a picture"), (other, b"another")):
         put_rest_pictures(path, {"rest.png": content})
-    refused(RecordsExistError, "made by config", fields_beside, job(records), other)
+    refused(RecordsExistError, "made by config", write_extracted, job(records), other)
     assert rest_pictures(other) == {"rest.png": b"another"}
-    fields_beside(job(records), tmp_path / "out")
+    write_extracted(job(records), tmp_path / "out")
     put_rest_pictures(records, {"rest.png": b"another"})
-    refused(RecordsExistError, "made by config", fields_beside, job(records), tmp_path / "out")
+    refused(RecordsExistError, "made by config", write_extracted, job(records), tmp_path / "out")
     assert rest_pictures(tmp_path / "out") == {"rest.png": b"a picture"}
+
+
+def test_an_extraction_of_other_recordings_is_not_continued(tmp_path):
+    """Under the same keys and in files of the same size, which is all that the index knows."""
+    records = written(tmp_path / "records", 1, force_n=np.full((3, 3), -1.5, np.float32))
+    before = RecordStore(records).digest
+    write_extracted(job(records), tmp_path / "out")
+    shutil.rmtree(records)
+    assert RecordStore(written(records, 1, force_n=np.full((3, 3), -2.5, np.float32))).digest == before
+    refused(RecordsExistError, "made by config", write_extracted, job(records), tmp_path / "out")
 
 
 def test_a_contact_without_a_gel_at_rest_costs_no_other(tmp_path):
@@ -134,21 +145,21 @@ def test_a_contact_without_a_gel_at_rest_costs_no_other(tmp_path):
         writer.write_object(fakes.card(0))
         for trial in range(4):
             writer.write_contact([recorded(trial=trial, **(lost if trial in (0, 2) else {}))])
-    skipped = fields_beside(job(tmp_path / "records"), tmp_path / "out", frames_per_shard=3)
+    skipped = write_extracted(job(tmp_path / "records"), tmp_path / "out", frames_per_shard=3)
     store = RecordStore(tmp_path / "out")
     assert [store.contact(i)["gelsight_mini"].key.trial for i in range(len(store))] == [1, 3]
     assert [skip.name for skip in skipped] == [f"object_0/0/press/{trial}/gelsight_mini" for trial in (0, 2)]
     assert "gone.png is absent" in skipped[0].reason
     assert store.meta.notes["fields"]["skipped"] == [dataclasses.asdict(skip) for skip in skipped]
-    assert fields_beside(job(tmp_path / "records"), tmp_path / "out", frames_per_shard=3) == skipped
+    assert write_extracted(job(tmp_path / "records"), tmp_path / "out", frames_per_shard=3) == skipped
 
 
 @pytest.mark.parametrize("when", ["before a part", "after a part"])
 def test_an_extraction_that_was_killed_goes_on(tmp_path, monkeypatch, when):
     records = written(tmp_path / "records", 4)
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    fields_beside(job(records), whole, frames_per_shard=6)
-    make, calls = beside.make_part, []
+    write_extracted(job(records), whole, frames_per_shard=6)
+    make, calls = extracted_records.make_part, []
 
     def die(*args):
         calls.append(args[1])
@@ -158,11 +169,11 @@ def test_an_extraction_that_was_killed_goes_on(tmp_path, monkeypatch, when):
         if len(calls) == 3:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(beside, "make_part", die)
+    monkeypatch.setattr(extracted_records, "make_part", die)
     with pytest.raises(KeyboardInterrupt):
-        fields_beside(job(records), killed, frames_per_shard=6)
+        write_extracted(job(records), killed, frames_per_shard=6)
     assert len(RecordStore(killed, allow_incomplete=True)) == 2
-    fields_beside(job(records), killed, frames_per_shard=6)
+    write_extracted(job(records), killed, frames_per_shard=6)
     assert calls == [0, 1, 2, *([2] if when == "before a part" else []), 3]
     for name in sorted(f.name for f in whole.glob("contacts-*")):
         assert (killed / name).read_bytes() == (whole / name).read_bytes()
@@ -171,10 +182,10 @@ def test_an_extraction_that_was_killed_goes_on(tmp_path, monkeypatch, when):
 
 def test_what_cannot_be_extracted_is_one_line(tmp_path):
     records, out = written(tmp_path / "records", 1), tmp_path / "out"
-    extract = functools.partial(fields_beside, out=out)
+    extract = functools.partial(write_extracted, out=out)
     refused(CalibrationError, "no gel at rest was recorded", extract, job(records, gel=RestGel()))
     for inside in (records, records / "fields"):
-        refused(CalibrationError, "must not be the records", fields_beside, job(records), inside)
+        refused(CalibrationError, "must not be the records", write_extracted, job(records), inside)
     refused(CalibrationError, "--sensor is 'tac3d'", extract, job(records, sensor="tac3d", calibration=None))
     refused(CalibrationError, "carries no field", extract, job(records, calibration=None))
     refused(CalibrationError, "rows is -1", job, records, rows=-1)

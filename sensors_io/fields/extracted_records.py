@@ -1,4 +1,4 @@
-"""Fields beside the pictures of records: new records with both, a unit for each shard, resumed where it stopped."""
+"""Fields extracted from the pictures of records: new records with both, written in units of a shard and resumable."""
 
 import dataclasses
 import functools
@@ -54,15 +54,15 @@ class FieldsJob:
             )
 
     def hash(self, digest: str) -> str:
-        """First 16 hex digits of the SHA-256 of the job and of the digest of its records and their gels at rest."""
+        """First 16 hex digits of the SHA-256 of the job and of a digest of its records and their gels at rest."""
         background = b"" if self.gel.background is None else self.gel.background.tobytes()
         made_by = "" if self.calibration is None else self.calibration.hash
-        said = [digest, self.sensor, made_by, self.gel.rest_frames, self.gel.mm_per_px, self.rows]
-        text = json.dumps([*said, dataclasses.asdict(self.config)], default=str)
+        parts = [digest, self.sensor, made_by, self.gel.rest_frames, self.gel.mm_per_px, self.rows]
+        text = json.dumps([*parts, dataclasses.asdict(self.config)], default=str)
         return hashlib.sha256(text.encode() + background).hexdigest()[:16]
 
 
-def fields_beside(
+def write_extracted(
     job: FieldsJob,
     out: pathlib.Path,
     *,
@@ -70,7 +70,7 @@ def fields_beside(
     frames_per_shard: int = FRAMES_PER_SHARD,
     launcher: Launcher = HERE,
 ) -> tuple[Skip, ...]:
-    """Write records with the fields beside the pictures in `out`; contacts that are there already are kept.
+    """Write records with pictures and extracted fields into `out`; contacts that are there already are kept.
 
     A contact that cannot be read, such as one without a gel at rest, is left out and returned with the reason.
 
@@ -93,11 +93,13 @@ def fields_beside(
         )
     contacts, skipped = _readable_contacts(store, job)
     rests = rest_pictures(store.path)
+    content = [f"{name} {zlib.crc32(x)}" for name, x in rests.items()]
+    content += [f"{i} {store.checksum(i)}" for i in contacts]  # the index knows sizes alone
     fields = {"of": job.sensor, "records": store.digest, "rows": job.rows}
     meta = RecordsMeta(
         source=store.meta.source,
         licence=store.meta.licence,
-        config_hash=job.hash(" ".join([store.digest, *(f"{name} {zlib.crc32(x)}" for name, x in rests.items())])),
+        config_hash=job.hash(" ".join([store.digest, *content])),
         sensors=store.meta.sensors,
         notes={**store.meta.notes, "fields": fields | {"skipped": [dataclasses.asdict(skip) for skip in skipped]}},
     )
