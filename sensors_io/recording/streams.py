@@ -52,11 +52,16 @@ class Stream:
       number: of the stream in the session.
       feed: an open sensor.
       late_s: by which its stamps lie behind those of the force sensor, or of the first stream.
+
+    Attributes:
+      frames: journaled of this contact.
+      seen_ns: when the last sample that was looked at was taken, on the common clock.
     """
 
     def __init__(self, number: int, feed: SampleReader, late_s: float):
         self.feed, self.late_s = feed, late_s
         self.frames = 0
+        self.seen_ns = 0
         self._number = number
         self._before: collections.deque[Sample] = collections.deque(maxlen=_BEFORE)
         self._background = GelBackground()
@@ -72,6 +77,8 @@ class Stream:
         """Everything that came since the last look."""
         samples = self.feed.drain()
         self._newest = samples[-1] if samples else None
+        if samples:
+            self.seen_ns = int(self.time_ns(samples)[-1])
         return samples
 
     def time_ns(self, samples: list[Sample]) -> np.ndarray:
@@ -83,16 +90,16 @@ class Stream:
         """Keep frames that belong to no contact, the last few of them, in case one begins."""
         self._before.extend(samples)
 
-    def refresh(self, samples: list[Sample], *, touched: bool | None) -> None:
+    def refresh(self, samples: list[Sample], *, rest_ns: int | None) -> None:
         """Refresh the background by what shows the gel at rest.
 
         Args:
           samples: of the last look.
-          touched: by the force; `None` where there is none and the pictures must tell.
+          rest_ns: from which on it does, by the force; `None` where there is none and the pictures must tell.
         """
-        for sample in samples:
+        for time_ns, sample in zip(self.time_ns(samples).tolist(), samples, strict=True):
             if sample.frame is not None and sample.frame.ndim == 3:
-                seen = self._background.looks_touched(sample.frame) if touched is None else touched
+                seen = self._background.looks_touched(sample.frame) if rest_ns is None else time_ns < rest_ns
                 self._background.offer(sample.frame, touched=seen)
                 if not seen and self._background.frames % _DRIFT_EVERY == 0:
                     self._drift = self._background.drift()
