@@ -9,10 +9,12 @@ from typing import Any
 import cv2
 import numpy as np
 
+from sensors_io.index import INDEX, JOURNALS, Index
 from sensors_io.recording.assemble import assemble, background_name
 from sensors_io.recording.coach import ContactStage
-from sensors_io.records import RecordStore, RecordWriter
+from sensors_io.records import RecordsExistError, RecordStore, RecordWriter
 from sensors_io.schema import ContactKey, ObjectCard, SchemaError
+from sensors_io.shards import is_shard
 
 ATTEMPTS = 16
 """Of one contact: trial = level · ATTEMPTS + attempt."""
@@ -60,6 +62,22 @@ class Report:
     absent: collections.Counter[str] = dataclasses.field(default_factory=collections.Counter)
     silent: collections.Counter[str] = dataclasses.field(default_factory=collections.Counter)
     given_up: list[str] = dataclasses.field(default_factory=list)
+
+
+def require_own(out: pathlib.Path) -> None:
+    """Refuse shards of contacts that no index lists and that no killed session left, for it leaves journals too.
+
+    Raises:
+      RecordsExistError: they came from other records, and would be taken for remains and deleted.
+    """
+    if not (out / INDEX).exists() or any((out / JOURNALS).glob("*.journal")):
+        return
+    strange = {file.name for file in out.glob("contacts-*") if is_shard(file.name)} - {*Index.read(out).shard_files()}
+    if strange:
+        raise RecordsExistError(
+            f"{out} holds {min(strange)}, which its {INDEX} does not list: another folder of records was copied over "
+            "this one; separate them again, for one folder holds one index. Nothing was changed"
+        )
 
 
 class Book:

@@ -22,7 +22,7 @@ from sensors_io.devices.intake import Counts
 from sensors_io.force import ForceError, GravityModel, Mount
 from sensors_io.index import JOURNALS
 from sensors_io.recording.assemble import background_name
-from sensors_io.recording.book import Book, ObjectView, Report
+from sensors_io.recording.book import Book, ObjectView, Report, require_own
 from sensors_io.recording.coach import Advice, Coach, CoachConfig, ContactStage, FreeCoach, protocol
 from sensors_io.recording.journal import JournalWriter
 from sensors_io.recording.streams import SampleReader, Stream, StreamStatus
@@ -109,7 +109,7 @@ def record_session(
       stop: asked as often; True ends the session after bringing what was recorded into the records.
 
     Raises:
-      RecordsError: the records are another data set's, of other sensors, or are being written.
+      RecordsError: the records are another data set's, of other sensors, mixed with others, or are being written.
       SchemaError: no sensor, two of one name, or one that no file can be named by.
       ForceError: nothing tells the force that the protocol is led by.
       DeviceError: a device failed for good; what was recorded is in the records.
@@ -118,6 +118,7 @@ def record_session(
     for stream in streams:
         _require_names(config, stream.sensor)
     report = Report()
+    require_own(out)
     with RecordWriter(out, meta=_meta(config, streams), resume=True) as writer:
         journals = out / JOURNALS
         journals.mkdir(exist_ok=True)

@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import pathlib
+import shutil
 import signal
 import subprocess
 import sys
@@ -390,3 +391,16 @@ def test_late_frames_of_a_touch_are_not_taken_for_the_gel_at_rest(tmp_path):
     assert record_session(tmp_path, config, [Lit(hand)], Scale(hand), show=hand.show).contacts == 4
     for picture in sorted((tmp_path / "backgrounds").iterdir()):
         assert cv2.imread(str(picture)).max() == 0
+
+
+def test_shards_of_records_that_were_copied_into_others_are_not_deleted(tmp_path):
+    """A kill leaves a shard that no index lists and journals; a copy leaves the shard alone, or one of another name."""
+    ours, theirs = tmp_path / "ours", tmp_path / "theirs"
+    for out, name in ((ours, "cup"), (ours, "mug"), (theirs, "can")):
+        session(out, Hand(), dataclasses.replace(SHORT, object_id=name))
+    shutil.copytree(theirs, ours, dirs_exist_ok=True)
+    said = "contacts-00001.arrayrecord, which its index.json does not list"
+    refused(RecordsExistError, said, session, ours, Hand(), SHORT)
+    (ours / "contacts-00001.arrayrecord").rename(ours / "contacts-00001 (1).arrayrecord")
+    assert session(ours, Hand(), SHORT).contacts == 2
+    assert (ours / "contacts-00001 (1).arrayrecord").is_file()
