@@ -111,7 +111,8 @@ class UvcConfig:
           DeviceNotFoundError: none of them is, or several are.
         """
         if self.index is not None:
-            return CameraInfo(node=f"/dev/video{self.index}", product="", serial="", usb_id="")
+            unknown = CameraInfo(node=f"/dev/video{self.index}", product="", serial="", usb_id="")
+            return next((c for c in cameras if c.node == unknown.node), unknown)
         asked = f"serial {self.serial!r}" if self.serial else f"product {self.product!r}"
         if self.interface is not None:
             asked += f", interface {self.interface}"
@@ -222,6 +223,12 @@ class Uvc:
 
     def __enter__(self) -> Self:
         camera = self._config.choose(self._find())
+        before = self._identity
+        if before.where and (before.serial, before.product) != (camera.serial, camera.product):
+            raise DeviceNotFoundError(
+                f"{before.sensor} was {before.product!r} serial {before.serial or 'none'}, now there is {camera}: must "
+                "be the same camera while it is read; plug the first one in again, or start anew"
+            )
         capture = self._open_node(camera.node)
         if not capture.isOpened():
             capture.release()
