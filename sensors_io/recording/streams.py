@@ -13,6 +13,7 @@ from sensors_io.devices.intake import Counts
 from sensors_io.recording.journal import JournalWriter
 
 _BEFORE = 8  # frames kept from before a contact is armed: the gel untouched
+_SETTLE_S = 0.3  # after a camera was opened: its first frames may be dark, or cut off
 _DRIFT_EVERY = 25  # untouched frames: drift is slow, and costs half a millisecond to tell
 
 
@@ -66,6 +67,7 @@ class Stream:
         self._before: collections.deque[Sample] = collections.deque(maxlen=_BEFORE)
         self._background = GelBackground()
         self._drift: Drift | None = None
+        self._disconnects, self._settled_ns = -1, 0  # -1: not even opened yet
         self._newest: Sample | None = None
 
     @property
@@ -97,8 +99,11 @@ class Stream:
           samples: of the last look.
           rest_ns: from which on it does, by the force; `None` where there is none and the pictures must tell.
         """
-        for time_ns, sample in zip(self.time_ns(samples).tolist(), samples, strict=True):
-            if sample.frame is not None and sample.frame.ndim == 3:
+        times = self.time_ns(samples).tolist()
+        if samples and self.feed.counts.disconnects != self._disconnects:
+            self._disconnects, self._settled_ns = self.feed.counts.disconnects, times[0] + round(_SETTLE_S * NS_PER_S)
+        for time_ns, sample in zip(times, samples, strict=True):
+            if sample.frame is not None and sample.frame.ndim == 3 and time_ns >= self._settled_ns:
                 seen = self._background.looks_touched(sample.frame) if rest_ns is None else time_ns < rest_ns
                 self._background.offer(sample.frame, touched=seen)
                 if not seen and self._background.frames % _DRIFT_EVERY == 0:
