@@ -130,6 +130,12 @@ class Record(Bench):
         ):
             if count:
                 OUT.print(f"{count} frames {problem}", highlight=False, soft_wrap=True)
+        if report.view_dropped:
+            OUT.print(
+                f"{self.object_id} keeps its first session's view: --contact-mm must be in the frame of the camera then",
+                highlight=False,
+                soft_wrap=True,
+            )
         for sensor, count in report.absent.items():
             OUT.print(f"{sensor} gave no frame in {count} of {report.contacts} contacts", highlight=False)
         for sensor, count in (+report.silent).items():

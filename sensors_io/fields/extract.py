@@ -19,7 +19,6 @@ from sensors_io.layer import Layer
 from sensors_io.quality import QualityConfig, saturated
 from sensors_io.schema import Flag, SchemaError, Spec, check_arrays
 
-
 _OTHER_GEL_LEVELS = (
     15.0  # three Minis differ by 4 to 6; swapped channels, a turned picture, 1.2 × the light by 20 to 29
 )

@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from sensors_io.cards import replace_cards
 from sensors_io.index import INDEX, JOURNALS, Index
 from sensors_io.recording.assemble import assemble, background_name
 from sensors_io.recording.coach import ContactStage
@@ -50,6 +51,7 @@ class Report:
       broken: frames with values that no sensor measures; they are flagged.
       absent: contacts in which a sensor of the session gave no frame, by its name.
       silent: contacts at the beginning or end of which a sensor gave no frame for long, by its name.
+      view_dropped: the object had a view already, from an earlier session, and keeps it.
       given_up: stages that `ATTEMPTS` contacts did not complete, in words.
     """
 
@@ -61,6 +63,7 @@ class Report:
     broken: int = 0
     absent: collections.Counter[str] = dataclasses.field(default_factory=collections.Counter)
     silent: collections.Counter[str] = dataclasses.field(default_factory=collections.Counter)
+    view_dropped: bool = False
     given_up: list[str] = dataclasses.field(default_factory=list)
 
 
@@ -78,6 +81,16 @@ def require_own(out: pathlib.Path) -> None:
             f"{out} holds {min(strange)}, which its {INDEX} does not list: another folder of records was copied over "
             "this one; separate them again, for one folder holds one index. Nothing was changed"
         )
+
+
+def complete_view(out: pathlib.Path, object_id: str, view: ObjectView) -> bool:
+    """Give the card of an object that was recorded without a view this one; False if it has one already."""
+    if not (out / INDEX).exists():
+        return True
+    card = RecordStore(out, allow_incomplete=True).objects.get(object_id)
+    if card is not None and card.view is None:
+        replace_cards(out, [dataclasses.replace(card, view=view.picture, view_depth_mm=view.depth_mm)])
+    return card is None or card.view is None
 
 
 class Book:

@@ -22,7 +22,7 @@ from sensors_io.devices.intake import Counts
 from sensors_io.force import ForceError, GravityModel, Mount
 from sensors_io.index import JOURNALS
 from sensors_io.recording.assemble import background_name
-from sensors_io.recording.book import Book, ObjectView, Report, require_own
+from sensors_io.recording.book import Book, ObjectView, Report, complete_view, require_own
 from sensors_io.recording.coach import Advice, Coach, CoachConfig, ContactStage, FreeCoach, protocol
 from sensors_io.recording.journal import JournalWriter
 from sensors_io.recording.streams import SampleReader, Stream, StreamStatus
@@ -117,8 +117,8 @@ def record_session(
     streams = tuple(Stream(i, feed, config.late_s.get(feed.identity.sensor, 0.0)) for i, feed in enumerate(tactile))
     for stream in streams:
         _require_names(config, stream.sensor)
-    report = Report()
     require_own(out)
+    report = Report(view_dropped=view is not None and not complete_view(out, config.object_id, view))
     with RecordWriter(out, meta=_meta(config, streams), resume=True) as writer:
         journals = out / JOURNALS
         journals.mkdir(exist_ok=True)

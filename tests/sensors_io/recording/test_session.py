@@ -243,6 +243,16 @@ def test_the_gel_at_rest_and_the_object_are_kept(tmp_path):
     assert store.contact(0)["gelsight_mini"].contact_region_px == (2, 1, 3, 4)
 
 
+def test_a_view_completes_the_card_of_an_object_and_a_second_one_is_said_to_be_dropped(tmp_path):
+    views = [ObjectView(picture=np.full((6, 8, 3), level, np.uint8)) for level in (90, 120)]
+    reports = [
+        session(tmp_path, Hand(), dataclasses.replace(SHORT, site=site), view=view)
+        for site, view in enumerate([None, *views])
+    ]
+    assert [report.view_dropped for report in reports] == [False, False, True]
+    assert RecordStore(tmp_path).objects["cup"].view[0, 0].tolist() == [90, 90, 90]
+
+
 def test_a_force_sensor_out_of_its_range_is_an_alarm_and_a_flag(tmp_path):
     class Strained(Scale):
         def drain(self):
