@@ -132,7 +132,7 @@ class Record(Bench):
                 OUT.print(f"{count} frames {problem}", highlight=False, soft_wrap=True)
         if report.view_dropped:
             OUT.print(
-                f"{self.object_id} keeps its first session's view: --contact-mm must be in the frame of the camera then",
+                f"{self.object_id} keeps its first view: --contact-mm must be in the frame of the camera of then",
                 highlight=False,
                 soft_wrap=True,
             )
