@@ -289,7 +289,9 @@ class Uvc:
         Raises:
           DeviceNotFoundError: the camera has no such size; a rate or format that it refuses is stored as it is.
         """
-        c = self._config
+        before = self._identity.settings  # a camera that was open comes back as it was: its pitch is that of one size
+        sizes = {name: getattr(self._config, name) or before.get(name, 0) for name in ("width", "height")}
+        c = dataclasses.replace(self._config, **sizes)
         if c.pixel_format:
             capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*c.pixel_format))
             capture.set(cv2.CAP_PROP_CONVERT_RGB, float(c.pixel_format != "Z16 "))

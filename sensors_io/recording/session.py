@@ -123,6 +123,12 @@ def record_session(
         journals = out / JOURNALS
         journals.mkdir(exist_ok=True)
         book = Book(writer, journals, report)
+        for other in writer.objects_done - {config.object_id}:
+            if other.casefold() == config.object_id.casefold():
+                raise SchemaError(
+                    f"object_id is {config.object_id!r}, and there is {other!r}: must differ in more than capitals, "
+                    "since their files have one name on many disks; correct it"
+                )
         book.add_object(config.object_id, view)
         book.recover()
         session = _Session(config, streams, force, show, stop, book, None if view is None else view.region_px)
@@ -335,7 +341,7 @@ class _Session:
             advice=advice,
             streams=tuple(stream.status() for stream in self._streams),
             force=None if self._force is None else self._force.counts,
-            alarm=self._alarm,
+            alarm=self._alarm or next(filter(None, (stream.alarm for stream in self._streams)), ""),
         )
 
 

@@ -13,6 +13,7 @@ from sensors_io.devices.intake import Counts
 from sensors_io.recording.journal import JournalWriter
 
 _BEFORE = 8  # frames kept from before a contact is armed: the gel untouched
+_LAMPS_LEVELS = 20.0  # that a channel of the gel at rest may change by; lamps that warm up change it by some percent
 _SETTLE_S = 0.3  # after a camera was opened: its first frames may be dark, or cut off
 _DRIFT_EVERY = 25  # untouched frames: drift is slow, and costs half a millisecond to tell
 
@@ -129,6 +130,14 @@ class Stream:
     def background(self) -> np.ndarray | None:
         """The gel at rest, uint8 [H, W, 3]; `None` before it was seen."""
         return self._background.picture() if self._background.frames else None
+
+    @property
+    def alarm(self) -> str:
+        """What the gel at rest tells of lamps and exposure; empty if they are as they were at first."""
+        levels = 0.0 if self._drift is None else float(np.abs(self._drift.mean).max())
+        if levels <= _LAMPS_LEVELS:
+            return ""
+        return f"{self.sensor} at rest has changed by {levels:.0f} grey levels: look at its lamps, exposure and lens"
 
     def begin(self) -> dict[str, Any]:
         """First entry of a journal: identity, delay, counts, and the drift of the background."""

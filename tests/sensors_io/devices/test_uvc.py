@@ -223,3 +223,12 @@ def test_a_camera_that_takes_the_place_of_the_one_that_was_unplugged_is_not_read
     plugged[:] = [CAMERAS[1]]
     with device:
         assert device.identity.serial == "28B4Z1A7"
+
+
+def test_a_camera_that_is_opened_again_is_asked_for_the_size_that_it_had():
+    """Its own size after a replug may be another one, while `mm_per_px` is that of the first."""
+    captures = [FakeCapture(), FakeCapture(size=(12, 16))]
+    device = Uvc(UvcConfig(index=0), find=lambda: (), capture=lambda node: captures.pop(0), wait=lambda *_: True)
+    for _ in range(2):
+        with device:
+            assert (device.identity.settings["width"], device.identity.settings["height"]) == (8, 6)

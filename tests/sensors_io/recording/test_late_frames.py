@@ -70,3 +70,22 @@ def test_the_first_frames_of_a_camera_are_not_taken_for_the_gel_at_rest(tmp_path
     record_session(tmp_path, config, [Warming(hand)], None if free_s else Scale(hand), show=hand.show)
     for picture in (tmp_path / "backgrounds").iterdir():
         assert cv2.imread(str(picture))[0, :, 0].tolist() == [60, 88, 116, 144, 172, 200]
+
+
+@pytest.mark.parametrize(("left", "alarmed"), [(0.0, True), (0.7, True), (0.9, False)])
+def test_lamps_that_go_out_or_exposure_that_moves_raise_an_alarm(tmp_path, left, alarmed):
+    class Fading(Camera):
+        """Its light falls to a share of itself after two seconds at rest."""
+
+        def drain(self):
+            lit = np.full((4, 6, 3), 100, np.uint8)
+            return [
+                dataclasses.replace(s, frame=(lit * (left if s.index > 200 else 1)).astype(np.uint8))
+                for s in super().drain()
+            ]
+
+    hand = Hand()
+    config = dataclasses.replace(SHORT, coach=dataclasses.replace(CONFIG.coach, clear_s=4.0))
+    record_session(tmp_path, config, [Fading(hand)], Scale(hand), show=hand.show)
+    said = {status.alarm for status in hand.statuses if status.alarm}
+    assert any("gelsight_mini at rest has changed by" in alarm for alarm in said) == alarmed

@@ -374,3 +374,9 @@ def test_shards_of_records_that_were_copied_into_others_are_not_deleted(tmp_path
     (ours / "contacts-00001.arrayrecord").rename(ours / "contacts-00001 (1).arrayrecord")
     assert session(ours, Hand(), SHORT).contacts == 2
     assert (ours / "contacts-00001 (1).arrayrecord").is_file()
+
+
+def test_an_object_that_differs_from_another_in_capitals_alone_is_refused(tmp_path):
+    session(tmp_path, Hand(), SHORT)
+    capital = dataclasses.replace(SHORT, object_id="Cup")
+    refused(SchemaError, "object_id is 'Cup', and there is 'cup': must differ", session, tmp_path, Hand(), capital)
