@@ -133,7 +133,7 @@ class Stream:
 
     @property
     def alarm(self) -> str:
-        """What the gel at rest tells of lamps and exposure; empty if they are as they were at first."""
+        """Warning that lamps or exposure have changed, by the gel at rest; empty if they are as they were at first."""
         levels = 0.0 if self._drift is None else float(np.abs(self._drift.mean).max())
         if levels <= _LAMPS_LEVELS:
             return ""

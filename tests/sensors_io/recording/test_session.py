@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
+from sensors_io.__main__ import main
 from sensors_io.devices.base import Identity
 from sensors_io.devices.errors import DeviceLostError
 from sensors_io.force import ForceError, GravityModel
@@ -363,7 +364,7 @@ def test_sensors_of_one_name_and_records_of_other_sensors_are_refused(tmp_path):
     refused(RecordsExistError, r"recorded-2 gelsight_mini', not 'recorded-2 gelsight_mini\+tac3d'", both, tmp_path)
 
 
-def test_shards_of_records_that_were_copied_into_others_are_not_deleted(tmp_path):
+def test_shards_of_records_that_were_copied_into_others_are_not_deleted(tmp_path, capsys):
     """A kill leaves a shard that no index lists and journals; a copy leaves the shard alone, or one of another name."""
     ours, theirs = tmp_path / "ours", tmp_path / "theirs"
     for out, name in ((ours, "cup"), (ours, "mug"), (theirs, "can")):
@@ -371,6 +372,8 @@ def test_shards_of_records_that_were_copied_into_others_are_not_deleted(tmp_path
     shutil.copytree(theirs, ours, dirs_exist_ok=True)
     said = "contacts-00001.arrayrecord, which its index.json does not list"
     refused(RecordsExistError, said, session, ours, Hand(), SHORT)
+    assert (main(["check", str(theirs)]), main(["check", str(ours)])) == (0, 1)
+    assert said in capsys.readouterr().err.replace("\n", " ")
     (ours / "contacts-00001.arrayrecord").rename(ours / "contacts-00001 (1).arrayrecord")
     assert session(ours, Hand(), SHORT).contacts == 2
     assert (ours / "contacts-00001 (1).arrayrecord").is_file()
