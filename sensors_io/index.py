@@ -26,6 +26,7 @@ from sensors_io.errors import MALFORMED, name_and_text, of_system
 from sensors_io.json_files import seal, unseal
 from sensors_io.remote import Place, StoreError, local
 from sensors_io.schema import MOTIONS
+from sensors_io.shards import shard_file
 from sensors_io.tables import NO_SENSOR, SHARD, ContactTable, GrowingFile, contact_dtype
 
 FORMAT = "touchr1-records"
@@ -187,6 +188,11 @@ class Index:
     def next_objects(self) -> int:
         """Number of the next shard of cards; none comes twice, though shards of replaced cards are gone."""
         return int(self.object_shards["number"].max()) + 1 if len(self.object_shards) else 0
+
+    def shard_files(self) -> tuple[str, ...]:
+        """Names of all shards."""
+        kinds = {"objects": self.object_shards, "contacts": self.contact_shards}
+        return tuple(shard_file(kind, number) for kind, rows in kinds.items() for number in rows["number"].tolist())
 
     def convert(self, root: pathlib.Path, splits: Mapping[str, str]) -> None:
         """Write the tables of an index of an older version; the root is not replaced yet."""

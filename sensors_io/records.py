@@ -32,7 +32,7 @@ from sensors_io.index import INDEX, Index, MissingIndexError, Part, RecordsMeta,
 from sensors_io.locks import RecordsExistError, write_lock
 from sensors_io.remote import at_url, place
 from sensors_io.schema import SPLITS, ContactKey, ObjectCard, SchemaError, Sequence
-from sensors_io.shards import Entries, ShardWriter, array_record_name, shard_file
+from sensors_io.shards import Entries, ShardWriter, array_record_name, is_shard
 from sensors_io.tables import ContactTable
 
 __all__ = [
@@ -288,9 +288,7 @@ class RecordStore:
     @property
     def files(self) -> tuple[str, ...]:
         """Names of all files but the root of the index, shards first; an index before version 3 has no others."""
-        kinds = {"objects": self._index.object_shards, "contacts": self._index.contact_shards}
-        shards = [shard_file(kind, number) for kind, rows in kinds.items() for number in rows["number"].tolist()]
-        return (*shards, *(table.file for table in self._index.tables.values() if table.size))
+        return (*self._index.shard_files(), *(table.file for table in self._index.tables.values() if table.size))
 
     @property
     def frames(self) -> dict[str, int]:
@@ -361,7 +359,7 @@ def _content(root: pathlib.Path, index: Index) -> str:
 def _start(root: pathlib.Path, meta: RecordsMeta, resume: bool, kept: Callable[[str], bool]) -> Index:
     """The index to go on from; files that it does not list are the remains of a killed writer and are removed."""
     index = Index.new(meta)
-    remains = [file for file in sorted(root.glob("*.arrayrecord")) if not kept(file.name)]
+    remains = [file for file in sorted(root.glob("*.arrayrecord")) if is_shard(file.name) and not kept(file.name)]
     if not (root / INDEX).exists() and remains:
         raise RecordsExistError(
             f"{remains[0]} is there, but no {INDEX}, which is written first: copy it back, or move the shards away"
@@ -383,8 +381,7 @@ def _start(root: pathlib.Path, meta: RecordsMeta, resume: bool, kept: Callable[[
             )
         convert(root, index)
         index.complete = False
-    shards = {"contacts": index.contact_shards, "objects": index.object_shards}
-    listed = {shard_file(kind, number) for kind, rows in shards.items() for number in rows["number"].tolist()}
+    listed = index.shard_files()
     for file in [*remains, *root.glob(".*.arrayrecord.*tmp")]:
         if file.name not in listed:
             file.unlink()

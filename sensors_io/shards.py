@@ -5,6 +5,7 @@ import contextlib
 import errno
 import os
 import pathlib
+import re
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from typing import TypeVar
@@ -27,6 +28,11 @@ _T = TypeVar("_T")
 def shard_file(kind: str, number: int) -> str:
     """Name of a shard of `contacts` or `objects`."""
     return f"{kind}-{number:05d}.arrayrecord"
+
+
+def is_shard(file: str) -> bool:
+    """True for a name that `shard_file` gives; copies that people and programs make have others."""
+    return re.fullmatch(r"(contacts|objects)-\d{5,}\.arrayrecord", file) is not None
 
 
 class ShardWriter:

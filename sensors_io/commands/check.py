@@ -3,6 +3,7 @@
 import collections
 import dataclasses
 import pathlib
+from collections.abc import Iterator
 
 import tyro
 from rich.table import Table
@@ -13,7 +14,14 @@ from sensors_io.fields.recorded import RecordedGels, RestGel, recorded_fields
 from sensors_io.fields.sources import read_picture
 from sensors_io.fields.types import Calibration, CalibrationError
 from sensors_io.index import JOURNALS
-from sensors_io.records import CorruptRecordsError, IncompleteRecordsError, RecordsError, RecordStore
+from sensors_io.recording.book import require_own
+from sensors_io.records import (
+    CorruptRecordsError,
+    IncompleteRecordsError,
+    RecordsError,
+    RecordsExistError,
+    RecordStore,
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -81,21 +89,28 @@ class Check:
                 OUT.print(overview.flag_table(looked, "flags by the pictures"))
             for reason, count in unseen.items():
                 OUT.print(f"not looked at: {count} sequences, {reason}", highlight=False)
-        if not store.complete:
-            problems.append(IncompleteRecordsError(f"{self.records}: its writing has not ended; run its command again"))
-        if journals := [*(self.records / JOURNALS).glob("*.journal")]:
-            problems.append(
-                IncompleteRecordsError(
-                    f"{journals[0].parent} holds {len(journals)} contacts that are not in the records: the next "
-                    "`record` there brings in what a killed one left"
-                )
-            )
+        problems.extend(self._unfinished(store))
         if kept := [*(self.records / JOURNALS).glob("*.refused")]:
             words = "contacts that were refused when they were recorded; move them away or delete them"
             OUT.print(f"{kept[0].parent} holds {len(kept)} {words}", markup=False, highlight=False, soft_wrap=True)
         for problem in problems:
             complain(problem)
         return 1 if problems else 0
+
+    def _unfinished(self, store: RecordStore) -> Iterator[RecordsError]:
+        """Name what a writer has not brought in, and what another one left."""
+        if not store.complete:
+            yield IncompleteRecordsError(f"{self.records}: its writing has not ended; run its command again")
+        else:
+            try:
+                require_own(self.records)
+            except RecordsExistError as strange:
+                yield strange
+        if journals := [*(self.records / JOURNALS).glob("*.journal")]:
+            yield IncompleteRecordsError(
+                f"{journals[0].parent} holds {len(journals)} contacts that are not in the records: the next "
+                "`record` there brings in what a killed one left"
+            )
 
     def _gels(self, store: RecordStore) -> RecordedGels:
         background = None if self.background is None else read_picture(self.background)

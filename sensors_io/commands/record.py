@@ -23,7 +23,7 @@ from sensors_io.devices.rgbd_camera import RgbdCameraConfig
 from sensors_io.force import Mount
 from sensors_io.offsets import Offsets
 from sensors_io.poses import ForceZero
-from sensors_io.recording.book import ATTEMPTS, ObjectView
+from sensors_io.recording.book import ATTEMPTS, ObjectView, Report
 from sensors_io.recording.coach import CoachConfig
 from sensors_io.recording.session import SessionConfig, Status, record_session
 from sensors_io.viewer.presenter import Presenter
@@ -120,25 +120,7 @@ class Record(Bench):
                 self.out, config, tactile, force[0] if force else None, show=show, view=view, stop=stop.is_set
             )
         OUT.print(f"{report.contacts} contacts written, {report.recovered} recovered, {report.incomplete} incomplete")
-        for count, problem in (
-            (
-                report.left_out,
-                "were left out: their size or arrays differ from most of their contact; fix the size of the camera, as "
-                "with --width of uvc",
-            ),
-            (report.broken, "hold values that no sensor measures: flagged incomplete"),
-        ):
-            if count:
-                OUT.print(f"{count} frames {problem}", highlight=False, soft_wrap=True)
-        for sensor, count in report.absent.items():
-            OUT.print(f"{sensor} gave no frame in {count} of {report.contacts} contacts", highlight=False)
-        for sensor, count in (+report.silent).items():
-            OUT.print(
-                f"{sensor} was silent at the beginning or end of {count} of {report.contacts} contacts: the frame "
-                "next to the gap is flagged time_gap; look at its connection",
-                highlight=False,
-                soft_wrap=True,
-            )
+        _tell_losses(self.object_id, report)
         if report.given_up:
             stages = ", ".join(report.given_up)
             OUT.print(f"given up after {ATTEMPTS} attempts: {stages}; name another --site", soft_wrap=True)
@@ -189,6 +171,35 @@ class Record(Bench):
             OUT.print(f"live view at {live.address}", highlight=False)
             with Presenter(channels, force[0] if force else None, live, board.words).in_thread():
                 yield
+
+
+def _tell_losses(object_id: str, report: Report) -> None:
+    """Say what a session left out, flagged or dropped."""
+    for count, problem in (
+        (
+            report.left_out,
+            "were left out: their size or arrays differ from most of their contact; fix the size of the camera, as "
+            "with --width of uvc",
+        ),
+        (report.broken, "hold values that no sensor measures: flagged incomplete"),
+    ):
+        if count:
+            OUT.print(f"{count} frames {problem}", highlight=False, soft_wrap=True)
+    if report.view_dropped:
+        OUT.print(
+            f"{object_id} keeps its first view: --contact-mm must be in the frame of the camera of then",
+            highlight=False,
+            soft_wrap=True,
+        )
+    for sensor, count in report.absent.items():
+        OUT.print(f"{sensor} gave no frame in {count} of {report.contacts} contacts", highlight=False)
+    for sensor, count in (+report.silent).items():
+        OUT.print(
+            f"{sensor} was silent at the beginning or end of {count} of {report.contacts} contacts: the frame "
+            "next to the gap is flagged time_gap; look at its connection",
+            highlight=False,
+            soft_wrap=True,
+        )
 
 
 _LITTLE_BYTES = 5e9

@@ -111,7 +111,8 @@ class UvcConfig:
           DeviceNotFoundError: none of them is, or several are.
         """
         if self.index is not None:
-            return CameraInfo(node=f"/dev/video{self.index}", product="", serial="", usb_id="")
+            unknown = CameraInfo(node=f"/dev/video{self.index}", product="", serial="", usb_id="")
+            return next((c for c in cameras if c.node == unknown.node), unknown)
         asked = f"serial {self.serial!r}" if self.serial else f"product {self.product!r}"
         if self.interface is not None:
             asked += f", interface {self.interface}"
@@ -222,6 +223,12 @@ class Uvc:
 
     def __enter__(self) -> Self:
         camera = self._config.choose(self._find())
+        before = self._identity
+        if before.where and (before.serial, before.product) != (camera.serial, camera.product):
+            raise DeviceNotFoundError(
+                f"{before.sensor} was {before.product!r} serial {before.serial or 'none'}, now there is {camera}: must "
+                "be the same camera while it is read; plug the first one in again, or start anew"
+            )
         capture = self._open_node(camera.node)
         if not capture.isOpened():
             capture.release()
@@ -282,7 +289,9 @@ class Uvc:
         Raises:
           DeviceNotFoundError: the camera has no such size; a rate or format that it refuses is stored as it is.
         """
-        c = self._config
+        before = self._identity.settings  # a camera that was open comes back as it was: its pitch is that of one size
+        sizes = {name: getattr(self._config, name) or before.get(name, 0) for name in ("width", "height")}
+        c = dataclasses.replace(self._config, **sizes)
         if c.pixel_format:
             capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*c.pixel_format))
             capture.set(cv2.CAP_PROP_CONVERT_RGB, float(c.pixel_format != "Z16 "))

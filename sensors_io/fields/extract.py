@@ -1,6 +1,7 @@
 """All fields of a sensor's pictures in one call, and flags for what a picture cannot carry."""
 
 import dataclasses
+import warnings
 from typing import Any, Literal
 
 import cv2
@@ -17,6 +18,14 @@ from sensors_io.fields.types import Calibration, CalibrationError, Fields
 from sensors_io.layer import Layer
 from sensors_io.quality import QualityConfig, saturated
 from sensors_io.schema import Flag, SchemaError, Spec, check_arrays
+
+_OTHER_GEL_LEVELS = (
+    15.0  # three Minis differ by 4 to 6; swapped channels, a turned picture, 1.2 × the light by 20 to 29
+)
+
+
+class OtherGelWarning(UserWarning):
+    """Pictures whose gel at rest looks unlike that of their calibration."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -171,6 +180,7 @@ class Extractor:
                 f"calibration is for {made}, the background is {self.background.shape[:2]} px of {self.mm_per_px} mm: "
                 "must be equal; calibrate this camera"
             )
+        _compare(calibration.background, self.background)
         today = dataclasses.replace(calibration, background=self.background)
         return DepthReader(today, zero=self.config.zero, contact=self.config.contact)
 
@@ -201,6 +211,20 @@ class Extractor:
         found = self._shear.read(moved, coarse, valid, touching)
         shear = found.shear_mm if self.config.shear == "modelled" else found.subtracted_mm
         return {"shear_mm": shear, "traction_mpa": found.traction_mpa, "force_n": found.force_n}
+
+
+def _compare(calibrated: np.ndarray, rest: np.ndarray) -> None:
+    """Warn if the gel at rest, uint8 [H, W, 3], looks unlike that of the calibration, marks and dirt aside."""
+    small = [cv2.resize(p, (32, 24), interpolation=cv2.INTER_AREA).astype(np.float32) for p in (calibrated, rest)]
+    levels = float(np.median(np.abs(small[0] - small[1]), axis=(0, 1)).max())
+    if levels > _OTHER_GEL_LEVELS:
+        warnings.warn(
+            f"the gel at rest differs from that of the calibration by {levels:.0f} grey levels in half of the window: "
+            "depth may be wrong; look whether it is the same sensor, lamps, exposure, channel order and side up, or "
+            "calibrate again",
+            OtherGelWarning,
+            stacklevel=5,
+        )
 
 
 def joined(parts: list[Fields]) -> Fields:

@@ -66,7 +66,7 @@ def list_feelanyforce(source: pathlib.Path, config: FeelAnyForceConfig) -> Catal
     Raises:
       ImportSourceError: no table there, or one without the columns, or no row with a reading.
     """
-    tables = sorted(path for path in source.glob("*") if path.suffix.lower() == ".csv")
+    tables = sorted(path for path in source.glob("[!.]*") if path.suffix.lower() == ".csv")
     require_files(source, tables, "<table>.csv with the columns tactile, depth, FT")
     rows, skipped = _rows(source, tables)
     if not any(row.force_n for row in rows):

@@ -60,7 +60,7 @@ def list_octopi(source: pathlib.Path, config: Keep) -> Catalogue:
     for path in samples:
         name = path.parent.name
         try:
-            data = json.loads(path.read_text(encoding="utf-8"))
+            data = json.loads(path.read_text(encoding="utf-8-sig"))
             card = _card(data)
             if cards.setdefault(card.object_id, card) != card:
                 raise ValueError(f"contradicts an earlier sample of {card.object_id}")
@@ -112,6 +112,8 @@ def _card(data: dict[str, Any]) -> ObjectCard:
 
 def _read(folder: pathlib.Path, key: ContactKey, data: dict[str, Any], config: Keep) -> Taken:
     paths = [path for path in numbered(folder / "tactile") if path.stem.isdecimal()]
+    others = sorted({path for path in inside(folder / "tactile") if path.is_file()} - {*paths})
+    strange = tuple(Skip(name=f"tactile/{path.name}", reason="is not named <number>.jpg") for path in others)
     pictures = read_pictures(paths, config.positions(len(paths)), config)
     number = np.array([int(paths[i].stem) - 1 for i in pictures.index])
     camera = {
@@ -128,4 +130,4 @@ def _read(folder: pathlib.Path, key: ContactKey, data: dict[str, Any], config: K
         camera=camera,
         frames=pictures.frames,
     )
-    return Taken(sequences=(sequence,), left_out=pictures.left_out)
+    return Taken(sequences=(sequence,), left_out=(*pictures.left_out, *strange))

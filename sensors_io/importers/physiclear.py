@@ -104,7 +104,7 @@ def read_labels(path: pathlib.Path) -> list[LabelledObject]:
     if not path.is_file():
         raise ImportSourceError(f"{path} is missing: give the directory that holds labels.json and videos/")
     try:
-        entries = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=distinct)["objects"]
+        entries = json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=distinct)["objects"]
         objects = [_labelled(entry) for entry in entries]
     except MALFORMED as error:
         raise ImportSourceError(f"{path}: {name_and_text(error)}; correct the entry") from error

@@ -20,7 +20,7 @@ def read_table(path: pathlib.Path, columns: Seq[str]) -> list[dict[str, str]]:
     """
     _require_file(path)
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             text = file.read()
             reader = csv.DictReader(io.StringIO(text, newline=""))
             missing = [name for name in columns if name not in (reader.fieldnames or ())]
@@ -45,7 +45,7 @@ def read_rows(path: pathlib.Path) -> list[list[str]]:
     """
     _require_file(path)
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             return _with_a_row(path, [row for row in csv.reader(file) if row])
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ImportSourceError(f"{path} cannot be read ({error}); give the published table") from error

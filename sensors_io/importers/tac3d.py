@@ -58,7 +58,7 @@ def list_tac3d(source: pathlib.Path, config: Shares) -> Catalogue:
     Raises:
       ImportSourceError: no .npz there.
     """
-    files = sorted(path for path in source.glob("*") if path.suffix.lower() == ".npz")
+    files = sorted(path for path in source.glob("[!.]*") if path.suffix.lower() == ".npz")
     require_files(source, files, "<name>_<serial>.npz with the arrays of a PyTac3D recording")
     contacts, names = [], plain_names((path.stem for path in files), SENSOR)
     for path in files:

@@ -35,7 +35,7 @@ def list_vtv150k(source: pathlib.Path, config: VTVConfig) -> Catalogue:
     Raises:
       ImportSourceError: no .mp4 there.
     """
-    videos = sorted((path for path in source.glob("*") if path.suffix.lower() == ".mp4"), key=natural)
+    videos = sorted((path for path in source.glob("[!.]*") if path.suffix.lower() == ".mp4"), key=natural)
     require_files(source, videos, "<object>_<n>.mp4")
     named = [(path, match) for path in videos if (match := _NAME.fullmatch(path.stem))]
     skipped = [Skip(name=p.name, reason="is not named <object>_<n>") for p in videos if not _NAME.fullmatch(p.stem)]

@@ -9,10 +9,13 @@ from typing import Any
 import cv2
 import numpy as np
 
+from sensors_io.cards import replace_cards
+from sensors_io.index import INDEX, JOURNALS, Index
 from sensors_io.recording.assemble import assemble, background_name
 from sensors_io.recording.coach import ContactStage
-from sensors_io.records import RecordStore, RecordWriter
+from sensors_io.records import RecordsExistError, RecordStore, RecordWriter
 from sensors_io.schema import ContactKey, ObjectCard, SchemaError
+from sensors_io.shards import is_shard
 
 ATTEMPTS = 16
 """Of one contact: trial = level · ATTEMPTS + attempt."""
@@ -48,6 +51,7 @@ class Report:
       broken: frames with values that no sensor measures; they are flagged.
       absent: contacts in which a sensor of the session gave no frame, by its name.
       silent: contacts at the beginning or end of which a sensor gave no frame for long, by its name.
+      view_dropped: the object had a view already, from an earlier session, and keeps it.
       given_up: stages that `ATTEMPTS` contacts did not complete, in words.
     """
 
@@ -59,7 +63,34 @@ class Report:
     broken: int = 0
     absent: collections.Counter[str] = dataclasses.field(default_factory=collections.Counter)
     silent: collections.Counter[str] = dataclasses.field(default_factory=collections.Counter)
+    view_dropped: bool = False
     given_up: list[str] = dataclasses.field(default_factory=list)
+
+
+def require_own(out: pathlib.Path) -> None:
+    """Refuse shards of contacts that no index lists and that no killed session left, for it leaves journals too.
+
+    Raises:
+      RecordsExistError: they came from other records, and would be taken for remains and deleted.
+    """
+    if not (out / INDEX).exists() or any((out / JOURNALS).glob("*.journal")):
+        return
+    strange = {file.name for file in out.glob("contacts-*") if is_shard(file.name)} - {*Index.read(out).shard_files()}
+    if strange:
+        raise RecordsExistError(
+            f"{out} holds {min(strange)}, which its {INDEX} does not list: another folder of records was copied over "
+            "this one; separate them again, for one folder holds one index. Nothing was changed"
+        )
+
+
+def complete_view(out: pathlib.Path, object_id: str, view: ObjectView) -> bool:
+    """Give the card of an object that was recorded without a view this one; False if it has one already."""
+    if not (out / INDEX).exists():
+        return True
+    card = RecordStore(out, allow_incomplete=True).objects.get(object_id)
+    if card is not None and card.view is None:
+        replace_cards(out, [dataclasses.replace(card, view=view.picture, view_depth_mm=view.depth_mm)])
+    return card is None or card.view is None
 
 
 class Book:

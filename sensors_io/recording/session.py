@@ -22,7 +22,7 @@ from sensors_io.devices.intake import Counts
 from sensors_io.force import ForceError, GravityModel, Mount
 from sensors_io.index import JOURNALS
 from sensors_io.recording.assemble import background_name
-from sensors_io.recording.book import Book, ObjectView, Report
+from sensors_io.recording.book import Book, ObjectView, Report, complete_view, require_own
 from sensors_io.recording.coach import Advice, Coach, CoachConfig, ContactStage, FreeCoach, protocol
 from sensors_io.recording.journal import JournalWriter
 from sensors_io.recording.streams import SampleReader, Stream, StreamStatus
@@ -32,6 +32,9 @@ from sensors_io.schema import MOTIONS, ContactKey, Phase, SchemaError, require_n
 _UNTOUCHED_S = 10.0  # of a pause before the first touch the last 10 to 20 s are kept: contacts are stored from memory
 _NAME_BYTES = 255  # of a file, in the common file systems
 _SILENT_S = 1.0  # of the force sensor while a camera goes on
+_RELAX_S = 1.0  # after a touch no frame shows the gel at rest: it relaxes, and stamps may be late
+_NEVER_NS = np.iinfo(np.int64).max
+_LATE_S = 1.0  # for frames that a link delivers when their contact is over
 _IDLE_S = 0.002  # between looks at the devices; a tenth of the fastest camera's period
 
 
@@ -106,7 +109,7 @@ def record_session(
       stop: asked as often; True ends the session after bringing what was recorded into the records.
 
     Raises:
-      RecordsError: the records are another data set's, of other sensors, or are being written.
+      RecordsError: the records are another data set's, of other sensors, mixed with others, or are being written.
       SchemaError: no sensor, two of one name, or one that no file can be named by.
       ForceError: nothing tells the force that the protocol is led by.
       DeviceError: a device failed for good; what was recorded is in the records.
@@ -114,11 +117,18 @@ def record_session(
     streams = tuple(Stream(i, feed, config.late_s.get(feed.identity.sensor, 0.0)) for i, feed in enumerate(tactile))
     for stream in streams:
         _require_names(config, stream.sensor)
-    report = Report()
+    require_own(out)
+    report = Report(view_dropped=view is not None and not complete_view(out, config.object_id, view))
     with RecordWriter(out, meta=_meta(config, streams), resume=True) as writer:
         journals = out / JOURNALS
         journals.mkdir(exist_ok=True)
         book = Book(writer, journals, report)
+        for other in writer.objects_done - {config.object_id}:
+            if other.casefold() == config.object_id.casefold():
+                raise SchemaError(
+                    f"object_id is {config.object_id!r}, and there is {other!r}: must differ in more than capitals, "
+                    "since their files have one name on many disks; correct it"
+                )
         book.add_object(config.object_id, view)
         book.recover()
         session = _Session(config, streams, force, show, stop, book, None if view is None else view.region_px)
@@ -179,21 +189,24 @@ class _Session:
         self._leads: Stream | None = None
         self._alarm = ""
         self._force_ns: int | None = None  # time of its last reading
+        self._touched_ns = 0  # time of the last reading of a touch
 
     def contact(self, stage: ContactStage, key: ContactKey) -> None:
         """Record one contact from the prompt to the records."""
         c = self._config
         coach = FreeCoach(c.free_s) if c.free_s > 0 else Coach(stage, c.coach)
         path = self._book.path(key)
-        complete, failure = False, None
+        over_ns, failure = None, None
         with JournalWriter(path) as journal:
             begin = lambda: journal.append("start", self._start(key, stage), **self._backgrounds())
             begin()
             try:
-                complete = self._run(stage, coach, journal, begin)
+                over_ns = self._run(stage, coach, journal, begin)
+                if over_ns is not None:
+                    self._hear_out(over_ns, journal)
             except DeviceError as error:
                 failure = error  # raised below, when what was recorded is in the records
-            journal.append("end", {"complete": complete, "counts": self._counts()}, **self._backgrounds())
+            journal.append("end", {"complete": over_ns is not None, "counts": self._counts()}, **self._backgrounds())
         for stream in self._streams:
             stream.end()
         self._book.store(path)
@@ -202,8 +215,8 @@ class _Session:
 
     def _run(
         self, stage: ContactStage, coach: Coach | FreeCoach, journal: JournalWriter, begin: Callable[[], None]
-    ) -> bool:
-        """Read until the coach says done; whether the contact is complete."""
+    ) -> int | None:
+        """Read until the coach says done; when a complete contact was over, `None` for another one."""
         phase: Phase | None = None
         advice: Advice | None = None
         waiting: tuple[int, Phase | None, int] | None = None  # time, phase and size of the journal
@@ -212,6 +225,7 @@ class _Session:
             times, forces = self._forces(looked, journal)
             for at, one in zip(times, forces, strict=True):
                 advice = coach.step(int(at), one)
+                self._touched_ns = int(at) if self._touches(advice) else self._touched_ns
                 if advice.recording and advice.phase != phase:
                     phase = advice.phase
                     journal.append("phase", {"time_ns": int(at), "phase": int(phase)})
@@ -224,23 +238,42 @@ class _Session:
             if advice is not None:
                 self._show(self._status(stage, advice))
                 if advice.done:
-                    return advice.complete
+                    return int(times[-1]) if advice.complete else None
             if not len(times) and not any(looked):
                 time.sleep(_IDLE_S)
-        return False
+        return None
+
+    def _hear_out(self, over_ns: int, journal: JournalWriter) -> None:
+        """Read on for frames of a contact that is over: a link may be late, though its stamps are right."""
+        end_s = time.monotonic() + _LATE_S
+        while not self._stop() and time.monotonic() < end_s:
+            late = [s for s in self._streams if 0 < over_ns - s.seen_ns < _LATE_S * NS_PER_S]
+            if not late:
+                return
+            for stream in late:
+                samples = stream.look()
+                kept = stream.time_ns(samples) <= over_ns
+                stream.journal([s for s, keep in zip(samples, kept, strict=True) if keep], journal)
+            if self._force is not None and (readings := self._force.drain()):
+                self._force_ns = readings[-1].host_time_ns
+            time.sleep(_IDLE_S)
 
     def _take(self, looked: Seq[list[Sample]], advice: Advice | None, journal: JournalWriter) -> None:
         """Journal the frames of a contact and those just before it; the untouched ones are the background."""
         recording = advice is not None and (advice.recording or advice.done)
-        touched = None
+        rest_ns = None
         if self._force is not None or self._leads is not None:
-            touched = advice is None or abs(advice.normal_n) >= self._config.coach.touch_n
+            touched = advice is None or self._touches(advice)
+            rest_ns = _NEVER_NS if touched else self._touched_ns + round(_RELAX_S * NS_PER_S)
         for stream, samples in zip(self._streams, looked, strict=True):
-            stream.refresh(samples, touched=touched)
+            stream.refresh(samples, rest_ns=rest_ns)
             if recording:
                 stream.journal(samples, journal)
             else:
                 stream.keep(samples)
+
+    def _touches(self, advice: Advice) -> bool:
+        return abs(advice.normal_n) >= self._config.coach.touch_n
 
     def _forces(self, looked: Seq[list[Sample]], journal: JournalWriter) -> tuple[np.ndarray, np.ndarray]:
         """Times [n] and forces [n, 3] on the gel: the force sensor's, else those that a tactile sensor tells."""
@@ -308,7 +341,7 @@ class _Session:
             advice=advice,
             streams=tuple(stream.status() for stream in self._streams),
             force=None if self._force is None else self._force.counts,
-            alarm=self._alarm,
+            alarm=self._alarm or next(filter(None, (stream.alarm for stream in self._streams)), ""),
         )
 
 

@@ -13,6 +13,8 @@ from sensors_io.devices.intake import Counts
 from sensors_io.recording.journal import JournalWriter
 
 _BEFORE = 8  # frames kept from before a contact is armed: the gel untouched
+_LAMPS_LEVELS = 20.0  # that a channel of the gel at rest may change by; lamps that warm up change it by some percent
+_SETTLE_S = 0.3  # after a camera was opened: its first frames may be dark, or cut off
 _DRIFT_EVERY = 25  # untouched frames: drift is slow, and costs half a millisecond to tell
 
 
@@ -52,15 +54,21 @@ class Stream:
       number: of the stream in the session.
       feed: an open sensor.
       late_s: by which its stamps lie behind those of the force sensor, or of the first stream.
+
+    Attributes:
+      frames: journaled of this contact.
+      seen_ns: when the last sample that was looked at was taken, on the common clock.
     """
 
     def __init__(self, number: int, feed: SampleReader, late_s: float):
         self.feed, self.late_s = feed, late_s
         self.frames = 0
+        self.seen_ns = 0
         self._number = number
         self._before: collections.deque[Sample] = collections.deque(maxlen=_BEFORE)
         self._background = GelBackground()
         self._drift: Drift | None = None
+        self._disconnects, self._settled_ns = -1, 0  # -1: not even opened yet
         self._newest: Sample | None = None
 
     @property
@@ -72,6 +80,8 @@ class Stream:
         """Everything that came since the last look."""
         samples = self.feed.drain()
         self._newest = samples[-1] if samples else None
+        if samples:
+            self.seen_ns = int(self.time_ns(samples)[-1])
         return samples
 
     def time_ns(self, samples: list[Sample]) -> np.ndarray:
@@ -83,16 +93,19 @@ class Stream:
         """Keep frames that belong to no contact, the last few of them, in case one begins."""
         self._before.extend(samples)
 
-    def refresh(self, samples: list[Sample], *, touched: bool | None) -> None:
+    def refresh(self, samples: list[Sample], *, rest_ns: int | None) -> None:
         """Refresh the background by what shows the gel at rest.
 
         Args:
           samples: of the last look.
-          touched: by the force; `None` where there is none and the pictures must tell.
+          rest_ns: from which on it does, by the force; `None` where there is none and the pictures must tell.
         """
-        for sample in samples:
-            if sample.frame is not None and sample.frame.ndim == 3:
-                seen = self._background.looks_touched(sample.frame) if touched is None else touched
+        times = self.time_ns(samples).tolist()
+        if samples and self.feed.counts.disconnects != self._disconnects:
+            self._disconnects, self._settled_ns = self.feed.counts.disconnects, times[0] + round(_SETTLE_S * NS_PER_S)
+        for time_ns, sample in zip(times, samples, strict=True):
+            if sample.frame is not None and sample.frame.ndim == 3 and time_ns >= self._settled_ns:
+                seen = self._background.looks_touched(sample.frame) if rest_ns is None else time_ns < rest_ns
                 self._background.offer(sample.frame, touched=seen)
                 if not seen and self._background.frames % _DRIFT_EVERY == 0:
                     self._drift = self._background.drift()
@@ -117,6 +130,14 @@ class Stream:
     def background(self) -> np.ndarray | None:
         """The gel at rest, uint8 [H, W, 3]; `None` before it was seen."""
         return self._background.picture() if self._background.frames else None
+
+    @property
+    def alarm(self) -> str:
+        """Warning that lamps or exposure have changed, by the gel at rest; empty if they are as they were at first."""
+        levels = 0.0 if self._drift is None else float(np.abs(self._drift.mean).max())
+        if levels <= _LAMPS_LEVELS:
+            return ""
+        return f"{self.sensor} at rest has changed by {levels:.0f} grey levels: look at its lamps, exposure and lens"
 
     def begin(self) -> dict[str, Any]:
         """First entry of a journal: identity, delay, counts, and the drift of the background."""

@@ -206,3 +206,29 @@ def test_a_camera_that_does_not_open_or_has_no_such_mode_is_named():
 
     with pytest.raises(DeviceNotFoundError, match="no mode of 640×480, it offers 8×6"):
         camera(Fixed(), width=640, height=480).__enter__()
+
+
+@pytest.mark.parametrize("asked", [{"index": 2}, {"product": "GelSight Mini"}])
+def test_a_camera_that_takes_the_place_of_the_one_that_was_unplugged_is_not_read(asked):
+    """After a replug the kernel may give its number to another camera, or another unit may be plugged in."""
+    other = CameraInfo(node="/dev/video2", product="GelSight Mini R0B 0000-AAAA", serial="0000AAAA", usb_id="0c45:636d")
+    plugged = [CAMERAS[1]]
+    device = Uvc(
+        UvcConfig(**asked), find=lambda: tuple(plugged), capture=lambda node: FakeCapture(), wait=lambda *_: True
+    )
+    with device:
+        assert device.identity.serial == "28B4Z1A7"
+    plugged[:] = [other]
+    refused(DeviceNotFoundError, "serial 28B4Z1A7, now there is /dev/video2 .*: must be the same", device.__enter__)
+    plugged[:] = [CAMERAS[1]]
+    with device:
+        assert device.identity.serial == "28B4Z1A7"
+
+
+def test_a_camera_that_is_opened_again_is_asked_for_the_size_that_it_had():
+    """Its own size after a replug may be another one, while `mm_per_px` is that of the first."""
+    captures = [FakeCapture(), FakeCapture(size=(12, 16))]
+    device = Uvc(UvcConfig(index=0), find=lambda: (), capture=lambda node: captures.pop(0), wait=lambda *_: True)
+    for _ in range(2):
+        with device:
+            assert (device.identity.settings["width"], device.identity.settings["height"]) == (8, 6)

@@ -9,7 +9,7 @@ import pytest
 from sensors_io.devices.sources import source_of
 from sensors_io.fields.deformation import DeformationReader
 from sensors_io.fields.evidence import Pattern
-from sensors_io.fields.extract import ExtractConfig, Extractor
+from sensors_io.fields.extract import ExtractConfig, Extractor, OtherGelWarning
 from sensors_io.fields.slopes import ColourMap
 from sensors_io.fields.sources import SourceError, read_pictures
 from sensors_io.fields.types import Calibration, CalibrationError, Fields
@@ -123,6 +123,15 @@ def test_what_does_not_fit_together_is_refused() -> None:
     refused(SchemaError, "grid_mm is None", Fields, contact=contact, flags=flags, mm_per_px=0.1, shear_mm=wrong)
     with pytest.raises(SchemaError, match=r"shape \[80, 214, 3\]: must be \[160, 214, 3\]"):
         Extractor(bare(), 0.1).read(bare()[:80])
+
+
+@pytest.mark.parametrize("change", [lambda p: p[..., ::-1], lambda p: (p * 0.8).astype(np.uint8), lambda p: p + 16])
+def test_a_gel_unlike_that_of_the_calibration_is_named(change) -> None:
+    """Swapped channels, less light, another unit; 14 grey levels are drift."""
+    rest = np.broadcast_to(np.array([80, 110, 140], np.uint8), bare().shape).copy()
+    with pytest.warns(OtherGelWarning, match="differs from that of the calibration by (16|28|60) grey levels"):
+        Extractor(change(rest), 0.1, calibration(rest))
+    Extractor(rest + np.uint8(14), 0.1, calibration(rest))
 
 
 def test_a_calibration_is_read_back_and_a_changed_one_is_refused(tmp_path: pathlib.Path) -> None:

@@ -74,3 +74,12 @@ def test_a_table_is_cut_into_pieces_and_nothing_is_lost(tmp_path):
     pieces = {(k.object_id, k.trial): store.contact(i)["gelsight_mini"] for i, k in enumerate(store.contacts)}
     forces = {key: sequence.force_n[:, 2].tolist() for key, sequence in pieces.items()}
     assert forces == {("cube", 0): [-1, -3, -5], ("cube", 1): [-7], ("ball", 0): [-2, -4, -6]}
+
+
+def test_a_table_with_a_byte_order_mark_is_read_and_what_macos_writes_beside_it_is_not(tmp_path):
+    source = write(tmp_path / "in", row(tmp_path / "in", 1000, "0 0 4.5 0 0 0"))
+    table = source / "20250414.csv"
+    table.write_bytes(b"\xef\xbb\xbf" + table.read_bytes())
+    (source / f"._{table.name}").write_bytes(b"of macOS")
+    report, _ = feel(source, tmp_path / "out")
+    assert (report.contacts, report.skipped) == (1, ())

@@ -82,3 +82,15 @@ def test_a_sample_without_a_usable_object_is_skipped(source, data, reason):
     [skip] = catalogue.skipped
     assert skip.name == "physiclear_99"
     assert reason in skip.reason
+
+
+def test_files_among_the_pictures_that_are_not_named_by_a_number_are_named(source, tmp_path):
+    """As downloads that were cut short or came twice."""
+    folder = source / "physiclear_10" / "tactile"
+    (folder / "0000000004.jpg").rename(folder / "0000000004.jpg.crdownload")
+    picture(folder / "0000000003 (1).jpg", 9)
+    (folder / "._0000000003.jpg").write_bytes(b"of macOS")
+    report, _ = imported(list_octopi(source, EVERYTHING), tmp_path / "out")
+    assert [(skip.name, skip.reason) for skip in report.skipped] == [
+        (f"tactile/{name}", "is not named <number>.jpg") for name in ("0000000003 (1).jpg", "0000000004.jpg.crdownload")
+    ]

@@ -69,3 +69,10 @@ def test_a_part_without_its_table_is_named(source):
     table.write_text(rows)
     (source / "contact_fine.csv").unlink()
     assert [skip.name for skip in list_tacquad(source, EVERYTHING).skipped] == ["data_fine"]
+
+
+def test_a_byte_order_mark_is_no_part_of_the_first_item(source, tmp_path):
+    table = source / "contact_indoor.csv"
+    table.write_bytes(b"\xef\xbb\xbf" + table.read_bytes())
+    report, _ = imported(list_tacquad(source, EVERYTHING), tmp_path / "out")
+    assert (report.contacts, report.skipped) == (3, ())

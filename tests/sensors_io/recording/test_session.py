@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import pathlib
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
+from sensors_io.__main__ import main
 from sensors_io.devices.base import Identity
 from sensors_io.devices.errors import DeviceLostError
 from sensors_io.force import ForceError, GravityModel
@@ -228,7 +230,8 @@ def test_the_gel_at_rest_and_the_object_are_kept(tmp_path):
     view = ObjectView(
         picture=np.full((6, 8, 3), 90, np.uint8), depth_mm=np.full((6, 8), 300.5, np.float32), region_px=(2, 1, 3, 4)
     )
-    session(tmp_path, Hand(), SHORT, view=view)
+    coach = dataclasses.replace(CONFIG.coach, clear_s=0.5)
+    session(tmp_path, Hand(), dataclasses.replace(SHORT, coach=coach), view=view)
     store = RecordStore(tmp_path)
     made = store.contact(1)["gelsight_mini"]
     name = made.camera["recording"]["background"]
@@ -239,6 +242,16 @@ def test_the_gel_at_rest_and_the_object_are_kept(tmp_path):
     assert store.objects["cup"].view.tolist() == view.picture.tolist()
     assert store.objects["cup"].view_depth_mm[0, 0] == 300.5
     assert store.contact(0)["gelsight_mini"].contact_region_px == (2, 1, 3, 4)
+
+
+def test_a_view_completes_the_card_of_an_object_and_a_second_one_is_said_to_be_dropped(tmp_path):
+    views = [ObjectView(picture=np.full((6, 8, 3), level, np.uint8)) for level in (90, 120)]
+    reports = [
+        session(tmp_path, Hand(), dataclasses.replace(SHORT, site=site), view=view)
+        for site, view in enumerate([None, *views])
+    ]
+    assert [report.view_dropped for report in reports] == [False, False, True]
+    assert RecordStore(tmp_path).objects["cup"].view[0, 0].tolist() == [90, 90, 90]
 
 
 def test_a_force_sensor_out_of_its_range_is_an_alarm_and_a_flag(tmp_path):
@@ -349,3 +362,24 @@ def test_sensors_of_one_name_and_records_of_other_sensors_are_refused(tmp_path):
     assert not (tmp_path / "x").exists()
     session(tmp_path, hand, SHORT)
     refused(RecordsExistError, r"recorded-2 gelsight_mini', not 'recorded-2 gelsight_mini\+tac3d'", both, tmp_path)
+
+
+def test_shards_of_records_that_were_copied_into_others_are_not_deleted(tmp_path, capsys):
+    """A kill leaves a shard that no index lists and journals; a copy leaves the shard alone, or one of another name."""
+    ours, theirs = tmp_path / "ours", tmp_path / "theirs"
+    for out, name in ((ours, "cup"), (ours, "mug"), (theirs, "can")):
+        session(out, Hand(), dataclasses.replace(SHORT, object_id=name))
+    shutil.copytree(theirs, ours, dirs_exist_ok=True)
+    said = "contacts-00001.arrayrecord, which its index.json does not list"
+    refused(RecordsExistError, said, session, ours, Hand(), SHORT)
+    assert (main(["check", str(theirs)]), main(["check", str(ours)])) == (0, 1)
+    assert said in capsys.readouterr().err.replace("\n", " ")
+    (ours / "contacts-00001.arrayrecord").rename(ours / "contacts-00001 (1).arrayrecord")
+    assert session(ours, Hand(), SHORT).contacts == 2
+    assert (ours / "contacts-00001 (1).arrayrecord").is_file()
+
+
+def test_an_object_that_differs_from_another_in_capitals_alone_is_refused(tmp_path):
+    session(tmp_path, Hand(), SHORT)
+    capital = dataclasses.replace(SHORT, object_id="Cup")
+    refused(SchemaError, "object_id is 'Cup', and there is 'cup': must differ", session, tmp_path, Hand(), capital)
