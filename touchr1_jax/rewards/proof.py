@@ -19,6 +19,12 @@ from touchr1_jax.types import Parsed, Target
 
 _LEVELS = (-1, 0, 1, 2)
 
+IMPURE = (
+    "is another function each time: must be pure, because a step traces it once, so that its random numbers, counters "
+    "and clocks stand still"
+)
+"""What is wrong with a function of which `written` is another each time."""
+
 
 def prove_rewards(
     rewards: Mapping[str, AnyReward], names: Iterable[str], sensors: int, attributes: int, length: int = 20
@@ -44,14 +50,22 @@ def prove_rewards(
         array; a value that changes after the segment where it is settled; no hash.  It names the reward.
     """
     for name in names:
-        if isinstance(rewards[name], HostReward):
-            continue
-        try:
-            hash(rewards[name])
-        except TypeError as error:
-            needs = "must have a hash, by which it is checked once; write @dataclass(eq=False), or a function"
-            raise RewardError(f"reward {name!r}: {error}, {needs}") from error
-        _prove(name, rewards[name], sensors, attributes, length)
+        if not isinstance(rewards[name], HostReward):
+            require_hash(f"reward {name!r}", rewards[name])
+            _prove(name, rewards[name], sensors, attributes, length)
+
+
+def require_hash(what: str, reward: object) -> None:
+    """Refuse a reward without a hash.
+
+    Raises:
+      RewardError: as `what` calls it.
+    """
+    try:
+        hash(reward)
+    except TypeError as error:
+        needs = "must have a hash, by which it is checked once; write @dataclass(eq=False), or a function"
+        raise RewardError(f"{what}: {error}, {needs}") from error
 
 
 @functools.cache
@@ -83,29 +97,40 @@ def _require_finite(name: str, values: np.ndarray, answers: Parsed, targets: Tar
 
 
 def _require_pure(name: str, reward: Reward | GroupReward, answers: Parsed, targets: Target, length: int) -> None:
-    """Trace a reward twice, for levels that every attribute has; if it looks elements up, check their indices."""
+    """`require_pure` for levels that every attribute has."""
     lowest = int(np.argmax(np.asarray(answers.compare)[:, 0] == 0))
     alike = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x)[lowest], x.shape), answers)
     one, target = (jax.tree.map(lambda x: np.asarray(x)[0], tree) for tree in (alike, targets))
     of = (one,) if isinstance(reward, Reward) else (np.zeros((len(alike.length), length), np.int32), alike)
-    once, again = (_written(reward.value, *of, target) for _ in range(2))
+    require_pure(f"reward {name!r}", reward.value, *of, target)
+
+
+def require_pure(what: str, value: Callable[..., Any], *of: Any) -> None:
+    """Trace a reward twice; if it looks elements up, check their indices.
+
+    Args:
+      what: what an error calls it.
+      value: the function.
+      of: its arguments, a `Target` among them.
+
+    Raises:
+      RewardError: another function each time, or an index beyond an array.
+    """
+    once, again = written(value, *of), written(value, *of)
     if once != again:
-        raise RewardError(
-            f"reward {name!r} is another function each time: must be pure, because a step traces it once, so that its "
-            "random numbers, counters and clocks stand still; compute from the arguments alone"
-        )
+        raise RewardError(f"{what} {IMPURE}; compute from the arguments alone")
     if not re.search(r"\b(gather|dynamic_slice)\[", once[0]):  # a constant index inside its array needs neither
         return
-    outside = jax.jit(checkify.checkify(reward.value, errors=checkify.index_checks))(*of, target)[0].get()
+    outside = jax.jit(checkify.checkify(value, errors=checkify.index_checks))(*of)[0].get()
     if outside:
-        sensors, attributes = one.perceive.shape
+        sensors, attributes = next((len(x.streams), len(x.label)) for x in of if isinstance(x, Target))
         raise RewardError(
-            f"reward {name!r}: {outside.splitlines()[0].split(': ', 1)[-1].rstrip('. ')}: must lie inside, or a step "
+            f"{what}: {outside.splitlines()[0].split(': ', 1)[-1].rstrip('. ')}: must lie inside, or a step "
             f"reads another element; bound it by jnp.clip: there are {sensors} sensors and {attributes} attributes"
         )
 
 
-def _written(value: Callable[..., Array], *of: Any) -> tuple[str, list[bytes]]:
+def written(value: Callable[..., Any], *of: Any) -> tuple[str, list[bytes]]:
     """The operations and numbers of a function, traced anew, without addresses in memory."""
     program = jax.make_jaxpr(lambda *of: value(*of))(*of)
     plain = lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x

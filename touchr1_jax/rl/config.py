@@ -178,8 +178,9 @@ class Algorithm:
                 raise ValueError(f"{field} is {bound}: must be above 0; None leaves it out")
         idle = {"learn_conclusion": "enumerated", "importance_sequence": "importance_cap", "kl_in_reward": "beta"}
         idle |= {"grounding_cap_nat": "gamma", "grounding_budget": "gamma", "entropy_floor_nat": "entropy_weight"}
-        idle |= {"tactile_margin": "tactile_use", "reference_share": "reference_every"}
-        idle |= {"grounding_stop_masked": "gamma"} | ({"reference_every": "beta"} if self.learn_conclusion else {})
+        idle |= {"grounding_stop_masked": "gamma", "reference_share": "reference_every"}
+        idle |= dict.fromkeys(("tactile_margin", "tactile_weight", "controls"), "tactile_use")
+        idle |= {"reference_every": "beta"} if self.learn_conclusion else {}
         for field, needed in idle.items():
             value, need = getattr(self, field), getattr(self, needed)
             if left_out(need) and value not in (None, getattr(type(self), field)):
@@ -227,9 +228,8 @@ class Stable(Algorithm):
     uninformative, all answers earn the same under a debiased reward, the policy drifts at random until one answer is
     left, and only the reference pulls it back.
 
-    If touch does not help, R_tu is paid in at most 9 % of groups, at margin δ = .13 with 4 rollouts of each of three
-    controls (15 % with two controls, 32 % with one; see `tactile_use`).  At the literal δ = .1, a single right answer
-    in eight would earn it (18 %).
+    If touch does not help, R_tu is paid in at most 9 % of groups (see `tactile_use`); at the literal δ = .1, a single
+    right answer in eight would earn it (18 %).
     """
 
     advantage: Advantage = Advantage.BATCH
@@ -364,14 +364,14 @@ class GRPOConfig:
         if self.prompts % (self.micro_prompts * (parts := self.algorithm.minibatches)):
             micro = f"{self.micro_prompts} of each of {parts} minibatches" if parts > 1 else f"{self.micro_prompts}"
             raise ValueError(f"micro_prompts {micro} must divide prompts {self.prompts}; choose a divisor of it")
-        if self.group < 2 and (self.algorithm.advantage, self.algorithm.enumerated) != (Advantage.GLOBAL, None):
-            needs = "must be at least 2, but for advantage GLOBAL without enumerated: rollouts are compared; raise it"
-            raise ValueError(f"group is {self.group}: {needs}")
+        of_batch, bonus = self.algorithm.advantage is Advantage.GLOBAL, self.algorithm.tactile_use
+        if self.group < 2 and not (of_batch and self.algorithm.enumerated is None and bonus != TactileUse.RECOMMENDED):
+            raise ValueError(f"group is {self.group}: must be at least 2 to compare rollouts (GLOBAL can do without)")
         apart = self.algorithm.advantage is Advantage.PER_REWARD or self.algorithm.segment_credit
-        if (best_of := self.algorithm.best_of) > 1 and (best_of > self.group or apart):
-            raise ValueError(
-                f"best_of is {best_of}: must be at most group {self.group}, and 1 for advantage PER_REWARD and for "
-                "segment_credit, which have no total to take the best of; lower it"
+        if (best_of := self.algorithm.best_of) > 1 and (best_of > self.group - (not of_batch) or apart):
+            raise ValueError(  # the best of all is one for all, which only other groups differ from
+                f"best_of is {best_of}: must be below group {self.group} (up to it for GLOBAL), and 1 for advantage "
+                "PER_REWARD and for segment_credit, which have no total to take the best of; lower it"
             )
         cuts = f"top_p is {self.top_p}, min_p {self.min_p}"
         if self.algorithm.enumerated is not None and (self.top_p, self.min_p) != (1, 0):

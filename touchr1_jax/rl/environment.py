@@ -17,6 +17,8 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from touchr1_jax.rewards.proof import IMPURE, written
+
 
 class Outcome(NamedTuple):
     """Result of one action: N observed tokens, which of them exist, the time that it took and the harm that it did.
@@ -149,7 +151,7 @@ def check_environment(environment: Environment, cases: Any, *, budget: int) -> O
     Raises:
       EnvironmentCheckError: a budget below 1, fewer than two actions, repeated words, a number of kinds other than that
         of the actions, functions that cannot be traced, a state that changes its shape, outcomes of wrong shapes or
-        types, a number that is not finite, negative seconds or harm.
+        types, a number that is not finite, negative seconds or harm, functions that are not pure.
     """
     actions = environment.actions
     if budget < 1:
@@ -172,14 +174,16 @@ def _all_outcomes(environment: Environment, cases: Any) -> Outcome:
     """Outcome of every action after a reset, [cases, actions, …], after a check of shapes and types."""
     index = jnp.arange(len(environment.actions))
 
+    reset, step = lambda e, case: e.reset(case), lambda e, state, action: e.step(state, action)
+
     def of_case(environment: Environment, case: Any) -> Any:
         state = environment.reset(case)
         return state, jax.vmap(environment.step, in_axes=(None, 0))(state, index)
 
     try:
         first = jax.tree.map(lambda x: x[0], cases)
-        state = jax.eval_shape(lambda e, c: e.reset(c), environment, first)
-        after, outcome = jax.eval_shape(lambda e, s, a: e.step(s, a), environment, state, index[0])
+        state = jax.eval_shape(reset, environment, first)
+        after, outcome = jax.eval_shape(step, environment, state, index[0])
     except Exception as error:
         raise EnvironmentCheckError(
             f"{type(environment).__name__} cannot be traced ({error}): must be a pytree whose reset and step compute "
@@ -189,6 +193,10 @@ def _all_outcomes(environment: Environment, cases: Any) -> Outcome:
     if shape(after) != shape(state):
         raise EnvironmentCheckError(f"step makes a state {shape(after)} of {shape(state)}: must keep shapes and types")
     _check_types(outcome)
+    for function, of in ((reset, (first,)), (step, (state, index[0]))):
+        if written(function, environment, *of) != written(function, environment, *of):
+            name = type(environment).__name__
+            raise EnvironmentCheckError(f"{name} {IMPURE}; keep a key in its state, and draw from that")
     return jax.device_get(jax.jit(jax.vmap(of_case, in_axes=(None, 0)))(environment, cases)[1][1])
 
 

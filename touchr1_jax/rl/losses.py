@@ -278,8 +278,8 @@ def surrogate(
         ratio = jax.lax.stop_gradient(ratio)
         weight = jnp.clip(ratio, 1.0 - low, 1.0 + high)
         return weight * a * log_prob, weight != ratio
-    free, bound = ratio * a, jnp.clip(ratio, 1.0 - low, 1.0 + high) * a
-    return jnp.minimum(free, bound), free > bound
+    free, bound = ratio * a, jax.lax.stop_gradient(jnp.clip(ratio, 1.0 - low, 1.0 + high)) * a
+    return jnp.where(free > bound, bound, free), free > bound  # `minimum` halves a gradient where both are equal
 
 
 def divisor(config: GRPOConfig, mask: Bool[Array, "P G T"]) -> int | Float[Array, ""]:

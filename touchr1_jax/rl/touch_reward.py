@@ -1,5 +1,6 @@
 """The reward of a trajectory: that of its answer minus the price of its time and of its harm."""
 
+import functools
 import itertools
 from collections.abc import Callable
 from typing import NamedTuple
@@ -9,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from touchr1_jax.rewards.base import RewardError
+from touchr1_jax.rewards.base import RESERVED, RewardError
 from touchr1_jax.rewards.exact import exact
+from touchr1_jax.rewards.proof import require_hash, require_pure
 from touchr1_jax.rl.environment import Outcome
 from touchr1_jax.types import Parsed, Target
 
@@ -53,11 +55,15 @@ def check_touch_reward(reward: TouchReward, prices: Prices, target: Target, outc
       budget: most actions of a trajectory.
 
     Raises:
-      RewardError: a price below 0 or not finite, a reward that is no dictionary of float scalars or is not finite.
+      RewardError: a price below 0 or not finite, a reward that is no dictionary of float scalars, has a term of a
+        metric's name, is not finite, is not pure, looks up beyond an array, or has no hash.
     """
     for name, price in prices._asdict().items():
         if not 0 <= float(price) < np.inf:
             raise RewardError(f"prices.{name} is {float(price)}: must be finite and ≥ 0; correct it")
+    require_hash("the reward", reward)
+    one, nothing = (jax.tree.map(lambda x: np.asarray(x)[0], tree) for tree in (target, _after(outcome, -1)))
+    require_pure("the reward", functools.partial(_terms, reward), np.zeros_like(one.label), one, nothing, prices)
     slowest = _after(outcome, np.argmax(outcome.seconds, -1))
     spent = [_after(outcome, action) for action in range(-1, outcome.seconds.shape[1])]
     spent += [Spent(*(times * total for total in slowest)) for times in range(2, budget + 1)]
@@ -119,6 +125,8 @@ def _terms(reward: TouchReward, level: Array, target: Target, spent: Spent, pric
     if not isinstance(terms, dict) or not terms:
         raise RewardError(f"the reward returns {terms!r}: must be a dictionary of named float scalars; name its terms")
     for name, term in terms.items():
+        if name in RESERVED:
+            raise RewardError(f"term {name!r} is the name of a metric of the engine; call the term otherwise")
         if jnp.shape(term) != () or not jnp.issubdtype(jnp.result_type(term), jnp.floating):
             raise RewardError(f"term {name!r} is {term}: must be a float scalar; sum it or convert it")
     return terms

@@ -74,12 +74,23 @@ def test_a_group_of_one_has_nothing_to_be_compared_with():
     """Its advantage would be 0 in every step; the mean of the batch needs no group."""
     with pytest.raises(ValueError, match="group is 1: must be at least 2"):
         GRPOConfig(group=1)
-    with pytest.raises(ValueError, match="best_of is 9: must be at most group 8"):
-        GRPOConfig(algorithm=Paper(best_of=9))
+    with pytest.raises(ValueError, match="group is 1: must be at least 2"):
+        GRPOConfig(group=1, algorithm=ReinforcePlusPlus(tactile_use=TactileUse.RECOMMENDED))
     with pytest.raises(ValueError, match=r"best_of is 2: must be .* 1 for advantage PER_REWARD"):
         GRPOConfig(algorithm=Paper(best_of=2, advantage=Advantage.PER_REWARD))
-    assert GRPOConfig(algorithm=Paper(best_of=8)).algorithm.best_of == 8
-    assert GRPOConfig(group=1, algorithm=ReinforcePlusPlus()).group == 1
+    assert GRPOConfig(group=1, algorithm=ReinforcePlusPlus(tactile_use=TactileUse.LITERAL)).group == 1
+
+
+@pytest.mark.parametrize("preset", [Paper, DrGrpo, Rloo])
+def test_the_best_of_a_whole_group_is_compared_with_that_of_others_alone(preset):
+    """Within the group all rollouts share it: a run that asks for pass@8 of groups of 8 would learn nothing."""
+    for too_many in (8, 9):
+        with pytest.raises(ValueError, match=f"best_of is {too_many}: must be below group 8"):
+            GRPOConfig(algorithm=preset(best_of=too_many))
+    assert GRPOConfig(algorithm=preset(best_of=7)).algorithm.best_of == 7
+    assert GRPOConfig(algorithm=ReinforcePlusPlus(best_of=8)).algorithm.best_of == 8
+    with pytest.raises(ValueError, match="best_of is 9"):
+        GRPOConfig(algorithm=ReinforcePlusPlus(best_of=9))
 
 
 def test_an_enumerated_level_is_not_drawn_from_a_nucleus():

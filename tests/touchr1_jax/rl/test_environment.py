@@ -137,12 +137,14 @@ class Faulty:
         tokens = jnp.ones((3, 2), jnp.int32 if self.fault == "outcome.tokens" else jnp.float32)
         exists = jnp.ones(2 if self.fault == "outcome.exists" else 3, bool)
         seconds = jnp.ones(1 if self.fault == "outcome.seconds" else ())
+        if self.fault == "pure":  # a step would trace it once: every contact of a run would take that time
+            seconds = seconds * np.random.default_rng().random()
         after = Count(jnp.ones(2) if self.fault == "state" else state.touches + 1.0)
         outcome = Outcome(tokens, exists, seconds, jnp.zeros(()))
         return after, tuple(outcome) if self.fault == "Outcome" else outcome
 
 
-FAULTS = ("kinds", "traced", "outcome.tokens", "outcome.exists", "outcome.seconds", "state", "Outcome")
+FAULTS = ("kinds", "traced", "outcome.tokens", "outcome.exists", "outcome.seconds", "state", "Outcome", "pure")
 
 
 @pytest.mark.parametrize("fault", FAULTS)

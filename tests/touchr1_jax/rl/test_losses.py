@@ -50,6 +50,17 @@ def test_clip_by_hand(advantage, value, clipped):
     np.testing.assert_allclose(gradient, np.where(clipped, 0, advantage * RATIO), rtol=1e-5)
 
 
+@pytest.mark.parametrize("kind", list(Surrogate))
+@pytest.mark.parametrize(("low", "high"), [(0.0, 0.2), (0.2, 0.0), (0.0, 0.0)])
+@pytest.mark.parametrize("advantage", [2.0, -2.0])
+def test_a_ratio_of_one_has_its_whole_gradient_at_the_bound_of_the_clip(kind, low, high, advantage):
+    """On policy all ratios are 1: a range that begins or ends there left .75 or .625 of the gradient."""
+    algorithm, zero = Paper(surrogate=kind, clip_low=low, clip_high=high), jnp.zeros(3)
+    run = lambda x: surrogate(algorithm, x, zero, zero == 0, jnp.array(advantage))
+    assert not run(zero)[1].any()
+    np.testing.assert_allclose(jax.grad(lambda x: run(x)[0].sum())(zero), advantage, rtol=1e-6)
+
+
 @pytest.mark.parametrize("gap", [-1e9, 1e9])
 def test_far_ratios_stay_finite(gap):
     """A padding token has a log-probability of −1e9; it is masked later, but 0 · ∞ would be NaN."""

@@ -407,6 +407,8 @@ def test_metrics_of_minibatches_count_prompts_and_weigh_streams_by_them():
         ({"grounding_budget": 0.05, "gamma": 0.0}, "grounding_budget is 0.05, but gamma is 0.0: set it or drop"),
         ({"entropy_floor_nat": 0.1}, "entropy_floor_nat is 0.1, but entropy_weight is 0.0: set it or drop"),
         ({"tactile_margin": 0.2}, "tactile_margin is 0.2, but tactile_use is TactileUse.OFF: set it or drop"),
+        ({"tactile_weight": 0.5}, "tactile_weight is 0.5, but tactile_use is TactileUse.OFF: set it or drop"),
+        ({"controls": 8}, "controls is 8, but tactile_use is TactileUse.OFF: set it or drop controls"),
         ({"kl_in_reward": True, "beta": 0.0}, "kl_in_reward is True, but beta is 0.0: set it or drop kl_in_reward"),
         ({"reference_every": 3, "beta": 0.0}, "reference_every is 3, but beta is 0.0: set it or drop reference_every"),
         (

@@ -1,5 +1,7 @@
 """The reward of a trajectory by hand, and what is found wrong with a reward before training."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -48,6 +50,11 @@ FAULTS = {
     "'bad' of the reward is inf": lambda p, t, s, c: {"bad": 1 / (1 - s.actions)},
     "float scalar": lambda p, t, s, c: {"bad": p.conclude},
     "dictionary": lambda p, t, s, c: s.seconds,
+    "'std' is the name of a metric": lambda p, t, s, c: {"std": s.seconds},
+    "the reward is another function each time": lambda p, t, s, c: {
+        "luck": s.seconds * np.random.default_rng().random()
+    },
+    "the reward: .* 7 .*: must lie inside": lambda p, t, s, c: {"seventh": 1.0 * t.label[s.actions + 7]},
 }
 
 
@@ -55,6 +62,16 @@ FAULTS = {
 def test_a_reward_that_is_no_number_is_named(outcome, names):
     with pytest.raises(RewardError, match=names):
         check_touch_reward(FAULTS[names], FREE, EVERY.target, outcome)
+
+
+def test_a_reward_without_a_hash_is_named(outcome):
+    @dataclasses.dataclass
+    class Fixed:
+        def __call__(self, parsed, target, spent, prices):
+            return {"answer": jnp.float32(1)}
+
+    with pytest.raises(RewardError, match="the reward: unhashable type: 'Fixed', must have a hash"):
+        check_touch_reward(Fixed(), FREE, EVERY.target, outcome)
 
 
 def test_a_reward_that_fails_after_the_second_action_is_named(outcome):
