@@ -143,6 +143,7 @@ def test_ctrl_c_leaves_no_traceback(monkeypatch):
     monkeypatch.setattr(AnnotateSheets, "run", Mock(side_effect=KeyboardInterrupt))
     assert main(["annotate-sheets", "records", "--out", "labels"]) == 130
     assert main(["annotate-sheets", "records", "--out", "s3://bucket/labels"]) == 2  # no folder of that name is made
+    assert main(["annotate-sheets", "records", "--out", "labels", "--seed", "-1"]) == 2
     assert main(["annotate-sheets", "x" * 300, "--out", "labels"]) == 1
 
 
