@@ -26,7 +26,7 @@ from experiments.core.commands import PROG, print_error, print_lines
 from experiments.core.errors import DataError
 from experiments.core.memory import require_memory
 from experiments.core.runner import COMPILED
-from experiments.study.policies import FILE, find_policy, is_policy, measured_figures
+from experiments.study.policies import FILE, POLICIES, find_policy, is_policy, measured_figures
 from sensors_io.commands.values import require_possible
 from sensors_io.errors import UserError
 from sensors_io.records import RecordStore
@@ -153,6 +153,9 @@ class ExportCommand(Places):
 
     def run(self) -> int:
         """Write the folder and return the exit status."""
+        above = Path(self.folder).resolve().parents
+        if len(above) > 2 and above[1].name == POLICIES and (above[2] / CONFIG_FILE).exists():
+            raise DataError(f"folder is {self.folder}: is the place of a run's own policy; name another")
         saved = find_policy(self.policy, self.runs_dir, self.weights).saved
         saved = dataclasses.replace(saved, notes={name: x for name, x in saved.notes.items() if name != FILE})
         if isinstance(saved.policy, ReleasedPolicy):

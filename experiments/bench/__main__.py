@@ -101,10 +101,13 @@ class Accept(FromRecords):
     candidates: tyro.conf.Positional[Path]  # file of the candidates, JSON Lines
 
     def run(self) -> int:
+        rejected = self.out.with_suffix(".rejected.jsonl")
+        if rejected.resolve() == self.candidates.resolve():
+            raise ItemError(f"candidates are {rejected}: would be replaced by those that are removed; rename the file")
         source = self.source()
         asks, contacts = draw_questions(source, self.quota, self.seed), source.bench.by_touch()
         found = apply_rules(read_candidates(read_lines(self.candidates), asks), contacts)
-        write_lines(self.out.with_suffix(".rejected.jsonl"), rejected_rows(found.removed))
+        write_lines(rejected, rejected_rows(found.removed))
         return _publish(self.out, found, source)
 
 
@@ -204,12 +207,15 @@ class AuditSheet:
     seed: int = 0
 
     def run(self) -> int:
+        beside = self.out.with_suffix(".key.json")
+        if beside.exists():  # its sheet may be with a judge
+            raise SheetError(f"{beside} exists, and its sheet needs it; move it away, or choose another place")
         items, store = read_items(self.items), RecordStore(self.records)
         key = audit.sample(items, min(self.count, len(items)), self.seed)
         with _contact_bar(store, "test") as advance:
             contacts = measure_split(store, "test", advance).by_touch()
         audit.write_blank(self.out, items, key, contacts)
-        write_json(self.out.with_suffix(".key.json"), key)
+        write_json(beside, key)
         OUT.print(f"{len(key)} items in {self.out}: answer yes or no in {', '.join(audit.AXES)}")
         return 0
 
@@ -225,6 +231,8 @@ class Audit:
     def run(self) -> int:
         if not 1 <= len(self.sheets) <= 2:
             raise SheetError(f"sheets holds {len(self.sheets)}: must be one or two; score judges in pairs")
+        if len({sheet.resolve() for sheet in self.sheets}) < len(self.sheets):
+            raise SheetError(f"sheets are {self.sheets[0]} twice: must be of two judges; name the other one")
         items = read_items(self.items)
         key = audit.read_key(self.key, items)
         judged = [audit.read_judgement(sheet, key) for sheet in self.sheets]

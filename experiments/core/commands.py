@@ -228,11 +228,15 @@ def _listing_of_runs(name: str, question: str, runs_dir: Path) -> list[str]:
 
 def _past_runs(home: Path) -> tuple[list[runs.PastRun], list[str]]:
     """The readable runs under `runs/NAME`, the newest first, and what is wrong with the others."""
-    past, damaged = [], []
+    past: list[runs.PastRun] = []
     try:
         begun = runs.started(home)
     except OSError as error:
         return [], [_unread(error)]
+    finished = sorted(path.parent for path in home.glob("*/results.json") if not path.parent.is_symlink())
+    damaged = [
+        f"{path} lacks its config.json: put a copy back, or move it away" for path in finished if path not in begun
+    ]
     for directory in begun:
         try:
             run = runs.read_run(directory)

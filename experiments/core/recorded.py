@@ -20,8 +20,8 @@ from typing import Any
 from experiments.core.artifacts import DamagedFileError, fitting, make_folder, read_json, write_json, write_text
 from experiments.core.report import write_report
 from experiments.core.results import from_json
-from experiments.core.runs import ROOT, PastRun
-from experiments.core.text import number
+from experiments.core.runs import ROOT, PastRun, read_description, read_results
+from experiments.core.text import MEANINGLESS, SMOKE, number
 
 RECORDED = Path("experiments/recorded")  # folder of the checkout with the run of each experiment that the README shows
 
@@ -41,12 +41,19 @@ class FigureError(ValueError):
 
 
 def record(run: Path, root: Path = ROOT) -> Path:
-    """Keep the results of a finished run in place of those of an earlier one; `FigureError` if it is not finished."""
+    """Keep the results of a finished run in place of those of an earlier one.
+
+    Raises:
+      FigureError: it is not finished, or of scale `smoke`.
+      DamagedFileError: its results are damaged, or those of another run.
+    """
     if not (run / "results.json").exists():
         raise FigureError(f"run is {run}: holds no results.json; finish it first")
-    results = read_json(run / "results.json")
-    with fitting(run / "results.json"):
-        path = root / RECORDED / f"{results['experiment']}.json"
+    description = read_description(run)
+    results = read_results(run / "results.json", description)
+    if description["scale"] == SMOKE:
+        raise FigureError(f"run is {run}: {MEANINGLESS}; record one of another scale")
+    path = root / RECORDED / f"{description['experiment']}.json"
     write_json(path, _placeless(results))
     return path
 

@@ -1,8 +1,9 @@
-"""Numbers of a configuration that can mean nothing, by those that all scales of its experiment have."""
+"""Numbers and lists of a configuration that can mean nothing, by those that all scales of its experiment have."""
 
 import dataclasses
+import types
 from collections.abc import Collection, Iterator
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 INT32_MAX = 2**31 - 1  # of the whole numbers that arrays, seeds and sizes are made of
 
@@ -15,6 +16,8 @@ LARGER = 1000
 
 def require_sizes(config: Any, scales: Collection[Any]) -> None:
     """Refuse what no scale has: numbers below 0 where none is, no steps, seeds or rounds where all have some, overflow.
+
+    So are lists that are empty, or hold a value twice, where that of no scale is or does.
 
     What a class checks by itself is left to it, and a seed may be 0.
 
@@ -42,6 +45,32 @@ def require_sizes(config: Any, scales: Collection[Any]) -> None:
         counts = least is not None and least >= 1 and not path.endswith("seeds" if isinstance(value, tuple) else "seed")
         if counts and any(isinstance(x, int) and x < 1 for x in numbers) and _is_unchecked(owner, path, value):
             raise ValueError(f"{path} is {value}: must be at least 1; raise it")
+        if isinstance(value, tuple) and others:
+            _require_list(owner, path, value, others)
+
+
+def _require_list(owner: Any, path: str, value: tuple[Any, ...], others: Collection[tuple[Any, ...]]) -> None:
+    """Refuse an empty list, and a value that is in it twice, unless its length is fixed or its class checks it."""
+    field = path.rpartition(".")[2]
+    if types.EllipsisType not in map(type, get_args(get_type_hints(type(owner))[field])):
+        return
+    if not value and all(others) and _takes(owner, field, next(iter(others)) * 2):
+        raise ValueError(f"{path} is (): must not be empty; name at least one")
+    if not any(map(_repeats, others)) and _repeats(value) and _takes(owner, field, tuple(dict.fromkeys(value))):
+        raise ValueError(f"{path} is {value}: must hold each once; drop what is there twice")
+
+
+def _repeats(value: tuple[Any, ...]) -> bool:
+    return len({*value}) < len(value)
+
+
+def _takes(owner: Any, field: str, value: Any) -> bool:
+    """True if a class accepts a value of its field."""
+    try:
+        dataclasses.replace(owner, **{field: value})
+    except (ValueError, TypeError):
+        return False
+    return True
 
 
 def _leaves(config: Any, prefix: str = "") -> dict[str, tuple[Any, Any]]:
@@ -63,9 +92,5 @@ def _is_number(value: Any) -> bool:
 
 def _is_unchecked(owner: Any, path: str, value: Any) -> bool:
     """True if a class accepts −1, which is no count: then it does not check the field."""
-    wrong = (-1,) * len(value) if isinstance(value, tuple) else -1
-    try:
-        dataclasses.replace(owner, **{path.rpartition(".")[2]: wrong})
-    except (ValueError, TypeError):
-        return False
-    return True
+    wrong: Any = (-1,) * len(value) if isinstance(value, tuple) else -1
+    return _takes(owner, path.rpartition(".")[2], wrong)

@@ -106,11 +106,13 @@ def confusion_map(answer: np.ndarray, label: np.ndarray, levels: Sequence[str], 
 
 
 def reliability_table(rows: Mapping[str, LevelAnswers], words: Words) -> Table:
-    """For every level: how often it is answered, its precision and its recall."""
+    """For every level of what was asked: how often it is answered, its precision and its recall."""
     lines: list[dict[str, Cell]] = []
     for name, answers in rows.items():
         for a, (attribute, levels) in enumerate(words.items()):
             asked = answers.label[:, a] != BOTTOM
+            if not asked.any():
+                continue
             answer, label, objects = answers.answer[asked, a], answers.label[asked, a], answers.objects[asked]
             lines += [
                 {

@@ -169,7 +169,7 @@ def open_data(config: TrainingConfig, view_px: int, context: Context, at_once: i
     Frames past the strain limit stay in: leaving them out would let the length of the force ramp give hardness away.
 
     Raises:
-      DataError: records of a sensor that answers cannot name, or a part without any label.
+      DataError: records of a sensor that answers cannot name, or a part without any label of hardness or the like.
       ConfigurationError: other records than the run began with.
     """
     clip = ClipConfig(
@@ -190,10 +190,12 @@ def open_data(config: TrainingConfig, view_px: int, context: Context, at_once: i
             f"{data.store.path} holds records of {', '.join(unknown)}: answers name {', '.join(known)}; import the "
             "records under one of these names, or add the sensor to `touchr1_jax.text.language`"
         )
-    if bare := [part for part in data.parts if data.labels(part).max() < 0]:  # else found after hours of training
+    scored = [ATTRIBUTES.index(name) for name in ORDINAL]
+    if bare := [part for part in data.parts if data.labels(part)[:, scored].max() < 0]:  # else found after training
         raise DataError(
-            f"part {bare[0]!r} of {data.store.path} holds no object with a label: every part needs one; label some by "
-            "`python -m sensors_io label RECORDS --labels LABELS.csv --annotator NAME`, or deal the splits out anew"
+            f"part {bare[0]!r} of {data.store.path} holds no object with a label of {', '.join(ORDINAL)}: every part "
+            "needs one, for scores are of them; label some by `python -m sensors_io label RECORDS --labels LABELS.csv "
+            "--annotator NAME`, or deal the splits out anew"
         )
     return data
 

@@ -17,7 +17,7 @@ MOST = 1e15
 
 
 def require_possible(value: Any, where: str = "") -> None:
-    """Refuse numbers that are no quantity, times below 0, ports beyond the last, pipes and devices, in all fields.
+    """Refuse numbers that are no quantity, times and seeds below 0, wrong ports, pipes and devices, in all fields.
 
     A pipe or a device is read without end, or not at all, and an output is renamed onto its path.  For an output at a
     URL a folder of that name would be made here.
@@ -51,6 +51,8 @@ def require_possible(value: Any, where: str = "") -> None:
         raise ValueError(f"{where} is {value}: must be a number within ±{MOST:g}; correct it")
     elif isinstance(value, float) and value < 0 and (where == "seconds" or where.endswith("_s")):
         raise ValueError(f"{where} is {value}: must be ≥ 0 seconds; correct it")
+    elif isinstance(value, int) and where == "seed" and value < 0:
+        raise ValueError(f"seed is {value}: must be at least 0; raise it")
     elif isinstance(value, int) and where.endswith("port") and not 0 <= value <= PORTS:
         raise ValueError(f"{where} is {value}: must lie in 0 … {PORTS}; correct it")
 

@@ -300,6 +300,11 @@ def test_an_exported_folder_and_a_repository_of_the_hub_are_policies(runs, asked
     assert run_asking(["export", str(folder), "hub:me/touch"]) == 0
     assert "model.safetensors" in uploaded
     assert "address" in capsys.readouterr().out
+    own = runs / "trial" / "latest" / "policies" / "sft" / "0"
+    before = (own / "config.json").read_bytes()
+    assert run_asking(["export", "trial/latest", str(own), "--precision", "int8", "--runs-dir", str(runs)]) == 1
+    assert "is the place of a run's own policy" in capsys.readouterr().err
+    assert (own / "config.json").read_bytes() == before
     with pytest.raises(PolicyError, match="no such folder"):
         load_policy("nowhere")
 

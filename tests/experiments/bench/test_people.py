@@ -54,6 +54,7 @@ def test_blank_sheets_hold_the_same_objects_in_other_orders(tmp_path):
         ("object,x\ncat,yes\n", "line 2: object 'cat' is not asked for"),
         ("object,x\ncup,perhaps\nball,no\n", "x is 'perhaps': must be one of yes, no"),
         ("object,x\ncup\nball,no\n", "x is None"),
+        ('object,x\ncup,"yes\n' + "ball,no\n" * 20_000, r"cannot be read \(field larger"),
     ],
 )
 def test_what_is_wrong_in_a_sheet_is_named(tmp_path, text, message):
@@ -142,6 +143,7 @@ def test_ctrl_c_leaves_no_traceback(monkeypatch):
     monkeypatch.setattr(AnnotateSheets, "run", Mock(side_effect=KeyboardInterrupt))
     assert main(["annotate-sheets", "records", "--out", "labels"]) == 130
     assert main(["annotate-sheets", "records", "--out", "s3://bucket/labels"]) == 2  # no folder of that name is made
+    assert main(["annotate-sheets", "records", "--out", "labels", "--seed", "-1"]) == 2
     assert main(["annotate-sheets", "x" * 300, "--out", "labels"]) == 1
 
 
@@ -191,7 +193,34 @@ def test_audits_by_command(items, source, tmp_path, capsys):
     audit.write_blank(sheet, items, sample, source.bench.by_touch())
     fill(sheet, lambda row: dict.fromkeys(audit.AXES, "yes"))
     write_json(key, sample)
-    assert main(["audit", str(path), str(key), str(sheet), str(sheet)]) == 0
+    assert main(["audit", str(path), str(key), str(sheet), str(sheet)]) == 1
+    assert "must be of two judges" in capsys.readouterr().err
+    second = tmp_path / "other.csv"
+    second.write_bytes(sheet.read_bytes())
+    assert main(["audit", str(path), str(key), str(sheet), str(second)]) == 0
     shown = capsys.readouterr().out
     assert "100.0 %" in shown
     assert "undefined" in shown
+
+
+def test_a_sample_of_one_object_has_no_interval_and_is_named(items, source, tmp_path, capsys):
+    path, sheet, key = tmp_path / "items.jsonl", tmp_path / "s.csv", tmp_path / "s.key.json"
+    write_items(path, items)
+    sample = audit.sample(items, 1, 1)
+    audit.write_blank(sheet, items, sample, source.bench.by_touch())
+    fill(sheet, lambda row: dict.fromkeys(audit.AXES, "yes"))
+    write_json(key, sample)
+    assert main(["audit", str(path), str(key), str(sheet)]) == 1
+    assert "the sample's 1 items are of one object: must be of two" in capsys.readouterr().err
+
+
+def test_no_command_replaces_what_a_person_needs(items, tmp_path, capsys):
+    """The key of a sheet that is with a judge; candidates in the file that removed ones go to."""
+    key, candidates = tmp_path / "s.key.json", tmp_path / "bench.rejected.jsonl"
+    for path in (key, candidates):
+        path.write_text("{}")
+    write_items(tmp_path / "q.jsonl", items[:3])
+    assert main(["audit-sheet", str(tmp_path / "q.jsonl"), "records", "--out", str(tmp_path / "s.csv")]) == 1
+    assert "s.key.json exists, and its sheet needs it" in capsys.readouterr().err
+    assert main(["accept", "records", str(candidates), "--out", str(tmp_path / "bench.jsonl")]) == 1
+    assert "would be replaced by those that are removed" in capsys.readouterr().err

@@ -20,9 +20,11 @@ from experiments.core.recorded import (
     recorded_run,
 )
 from experiments.core.runs import ROOT
+from experiments.core.text import SMOKE
 
 RESULTS = {
     "experiment": "coin",
+    "verdict": [],
     "config": {"data_dir": "/home/someone/touch data/x", "paths": ["/a/b.npz", "1/2", "/"]},
     "arms": {"paid": {"acc": {"mean": 62.96, "ci95": [60.0, 65.0]}}},
     "requirements": [{"name": "least gain", "measured": -0.25}],
@@ -30,10 +32,20 @@ RESULTS = {
 }
 
 
+DESCRIPTION = {
+    "experiment": "coin",
+    "scale": "default",
+    "config": RESULTS["config"],
+    "git": {"commit": "0123456789", "dirty": False},
+    "command": "python -m experiments coin",
+}
+
+
 @pytest.fixture
 def root(tmp_path):
     """A checkout with one recorded run."""
     run = tmp_path / "runs" / "coin"
+    write_json(run / "config.json", DESCRIPTION)
     write_json(run / "results.json", RESULTS)
     record(run, tmp_path)
     return tmp_path
@@ -74,10 +86,22 @@ def test_a_finished_run_is_recorded_whole_but_for_paths_of_the_machine(root, tmp
     assert "finish it first" in capsys.readouterr().err
     with pytest.raises(DamagedFileError, match=r"coin\.json is not that of a run .*'git'"):
         recorded_run("coin", tmp_path, root)
+    write_json(tmp_path / "config.json", DESCRIPTION)
     for damaged in ("{", "[]"):
         (tmp_path / "results.json").write_text(damaged)
         assert main(["record", str(tmp_path)]) == 1
         assert "results.json is" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [({"config": {}}, "is of another run, with another config"), ({"scale": SMOKE}, "the figures mean nothing")],
+)
+def test_results_of_another_run_and_of_smoke_are_not_recorded(root, change, said):
+    write_json(root / "runs" / "coin" / "config.json", DESCRIPTION | change)
+    with pytest.raises((DamagedFileError, FigureError), match=said):
+        record(root / "runs" / "coin", root)
+    assert "paid" in read_json(root / RECORDED / "coin.json")["arms"]
 
 
 @pytest.mark.long

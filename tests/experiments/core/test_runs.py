@@ -129,6 +129,7 @@ def test_a_damaged_run_hides_no_other(tmp_path, capsys):
     (make_run(tmp_path, "20260103-000000") / "config.json").write_text('{"model_type": "qwen2_5_vl"}')
     foreign = json.loads((make_run(tmp_path, "20260105-000000") / "config.json").read_text())
     write_json(tmp_path / "coin" / "20260105-000000" / "config.json", foreign | {"experiment": "die"})
+    (make_run(tmp_path, "20260106-000000", results=FINISHED) / "config.json").unlink()
     for arguments in (["list"], ["list", "coin"]):
         assert main([*arguments, "--runs-dir", str(tmp_path)], package=FAKES) == 0
         out = capsys.readouterr().out
@@ -137,6 +138,7 @@ def test_a_damaged_run_hides_no_other(tmp_path, capsys):
         assert "20260103-000000/config.json is not that of a run" in out
         assert "20260104-000000/config.json'" in out
         assert f"20260105-000000 is a run of die: move it to {tmp_path / 'die'}" in out
+        assert "20260106-000000 lacks its config.json: put a copy back" in out
         assert out.count("must be readable; correct its permissions") == 1
     (tmp_path / "coin").rename(tmp_path / "away")
     (tmp_path / "coin").symlink_to(UNREADABLE)

@@ -37,6 +37,14 @@ def test_reliability_by_hand():
     assert str(found).startswith("33.3 [")  # of three that are hard one was read as soft, one not at all
 
 
+def test_an_attribute_that_nobody_labelled_has_no_rows():
+    """Before, its share of nothing was NaN, and the run ended when it wrote its results."""
+    widened = lambda x, fill: np.concatenate([x, np.full_like(x, fill)], 1)
+    both = dataclasses.replace(ANSWERS, answer=widened(ANSWERS.answer, 0), label=widened(ANSWERS.label, -1))
+    words = WORDS | {"roughness": ("smooth", "rough")}
+    assert reliability_table({"sft": both}, words).rows == reliability_table({"sft": ANSWERS}, WORDS).rows
+
+
 def test_confusions_are_shares_of_each_label():
     """Two soft ones read as soft; of three hard ones one was read as soft, one as hard, one not at all."""
     found = confusion_map(ANSWERS.answer[:, 0], ANSWERS.label[:, 0], WORDS["hardness"], "hardness")

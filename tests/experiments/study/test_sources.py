@@ -194,14 +194,18 @@ def test_records_of_a_sensor_that_answers_cannot_name_are_refused(tmp_path, cont
         open_data(config, 32, context)
 
 
+@pytest.mark.parametrize("kept", [(), ("material",)])
 @pytest.mark.parametrize("split", ["train", "val", "test"])
-def test_a_part_without_labels_is_refused_before_training(tmp_path, records, context, split):
-    """Before, a run trained to its end and then found nothing to ask about its test contacts."""
+def test_a_part_without_labels_is_refused_before_training(tmp_path, records, context, split, kept):
+    """Before, a run trained to its end and then found nothing to ask, or nothing to score, about its test contacts."""
     shutil.copytree(records, tmp_path / "copy")
     cards = RecordStore(records).objects.values()
-    bare = [dataclasses.replace(card, labels={}) if card.split == split else card for card in cards]
+    left = lambda card: {name: level for name, level in card.labels.items() if name in kept}
+    bare = [dataclasses.replace(card, labels=left(card)) if card.split == split else card for card in cards]
     replace_cards(tmp_path / "copy", bare)
     config = dataclasses.replace(tiny.STUDY, data="records", data_dir=tmp_path / "copy")
     part = "sft" if split == "train" else split
-    with pytest.raises(DataError, match=f"part '{part}' of .*copy holds no object with a label: every part needs one"):
+    with pytest.raises(
+        DataError, match=f"part '{part}' of .*copy holds no object with a label of hardness, .*: every part"
+    ):
         open_data(config, 16, context)

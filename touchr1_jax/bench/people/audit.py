@@ -107,10 +107,12 @@ def pass_rates(judged: Judgement, key: Mapping[str, str], items: Sequence[Item])
     """Pass rates by axis, and of all three axes together, which is the paper's pass rate.
 
     Raises:
-      ValueError: fewer than two objects in the sample.
+      SheetError: fewer than two objects in the sample.
     """
     cluster = {item.ask.id: item.ask.cluster for item in items}
     objects = np.array([cluster[key[number]] for number in judged])
+    if len({*objects.tolist()}) < 2:
+        raise SheetError(f"the sample's {len(objects)} items are of one object: must be of two; draw more by --count")
     columns = {axis: [row[axis] for row in judged.values()] for axis in AXES}
     columns["all three"] = [all(row.values()) for row in judged.values()]
     return tuple(

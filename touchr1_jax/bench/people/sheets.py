@@ -49,17 +49,17 @@ def read_sheet(
     names = set(wanted)
     rows: dict[str, dict[str, str]] = {}
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        reader = csv.DictReader(io.StringIO(path.read_text(encoding="utf-8-sig"), newline=""))
+        lines = [(reader.line_num, row) for row in reader]
     except FileNotFoundError:
         raise SheetError(f"{path} is missing: must be a filled-in sheet; correct the path") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, csv.Error) as error:  # a quotation mark that is not closed takes all lines
         raise SheetError(f"{path} cannot be read ({error}): must be CSV in UTF-8; save it so") from error
-    reader = csv.DictReader(io.StringIO(text, newline=""))
     missing = [column for column in (key, *cells) if column not in (reader.fieldnames or ())]
     if missing:
         raise SheetError(f"{path} lacks the columns {missing}: must have {key}, {', '.join(cells)}; add them")
-    for row in reader:
-        where, name = f"{path}, line {reader.line_num}", row[key]
+    for line, row in lines:
+        where, name = f"{path}, line {line}", row[key]
         if name not in names or name in rows:
             why = "occurs twice" if name in rows else "is not asked for"
             raise SheetError(f"{where}: {key} {name!r} {why}; each row of the blank sheet belongs there once")
