@@ -207,15 +207,15 @@ class AuditSheet:
     seed: int = 0
 
     def run(self) -> int:
-        beside = self.out.with_suffix(".key.json")
-        if beside.exists():  # its sheet may be with a judge
-            raise SheetError(f"{beside} exists, and its sheet needs it; move it away, or choose another place")
+        key_file = self.out.with_suffix(".key.json")
+        if key_file.exists():  # its sheet may be with a judge
+            raise SheetError(f"{key_file} exists, and its sheet needs it; move it away, or choose another place")
         items, store = read_items(self.items), RecordStore(self.records)
         key = audit.sample(items, min(self.count, len(items)), self.seed)
         with _contact_bar(store, "test") as advance:
             contacts = measure_split(store, "test", advance).by_touch()
         audit.write_blank(self.out, items, key, contacts)
-        write_json(beside, key)
+        write_json(key_file, key)
         OUT.print(f"{len(key)} items in {self.out}: answer yes or no in {', '.join(audit.AXES)}")
         return 0
 
