@@ -118,8 +118,9 @@ def record_session(
     for stream in streams:
         _require_names(config, stream.sensor)
     require_own(out)
-    report = Report(view_dropped=view is not None and not complete_view(out, config.object_id, view))
-    with RecordWriter(out, meta=_meta(config, streams), resume=True) as writer:
+    meta = _meta(config, streams)
+    report = Report(view_dropped=view is not None and not complete_view(out, meta, config.object_id, view))
+    with RecordWriter(out, meta=meta, resume=True) as writer:
         journals = out / JOURNALS
         journals.mkdir(exist_ok=True)
         book = Book(writer, journals, report)
