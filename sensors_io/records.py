@@ -381,7 +381,7 @@ def _start(root: pathlib.Path, meta: RecordsMeta, resume: bool, kept: Callable[[
             )
         convert(root, index)
         index.complete = False
-    listed = index.shard_files()
+    listed = {*index.shard_files()}
     for file in [*remains, *root.glob(".*.arrayrecord.*tmp")]:
         if file.name not in listed:
             file.unlink()

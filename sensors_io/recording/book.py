@@ -13,7 +13,7 @@ from sensors_io.cards import replace_cards
 from sensors_io.index import INDEX, JOURNALS, Index
 from sensors_io.recording.assemble import assemble, background_name
 from sensors_io.recording.coach import ContactStage
-from sensors_io.records import RecordsExistError, RecordStore, RecordWriter
+from sensors_io.records import RecordsExistError, RecordsMeta, RecordStore, RecordWriter
 from sensors_io.schema import ContactKey, ObjectCard, SchemaError
 from sensors_io.shards import is_shard
 
@@ -79,15 +79,19 @@ def require_own(out: pathlib.Path) -> None:
     if strange:
         raise RecordsExistError(
             f"{out} holds {min(strange)}, which its {INDEX} does not list: another folder of records was copied over "
-            "this one; separate them again, for one folder holds one index. Nothing was changed"
+            "this one, which must be separated again, or the journals of a killed session were deleted; move the shard "
+            "away. Nothing was changed"
         )
 
 
-def complete_view(out: pathlib.Path, object_id: str, view: ObjectView) -> bool:
+def complete_view(out: pathlib.Path, meta: RecordsMeta, object_id: str, view: ObjectView) -> bool:
     """Give the card of an object that was recorded without a view this one; False if it has one already."""
     if not (out / INDEX).exists():
         return True
-    card = RecordStore(out, allow_incomplete=True).objects.get(object_id)
+    store = RecordStore(out, allow_incomplete=True)
+    if (store.meta.config_hash, store.meta.licence) != (meta.config_hash, meta.licence):
+        return True  # records of another making, which the writer refuses
+    card = store.objects.get(object_id)
     if card is not None and card.view is None:
         replace_cards(out, [dataclasses.replace(card, view=view.picture, view_depth_mm=view.depth_mm)])
     return card is None or card.view is None

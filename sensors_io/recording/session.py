@@ -33,7 +33,7 @@ _UNTOUCHED_S = 10.0  # of a pause before the first touch the last 10 to 20 s are
 _NAME_BYTES = 255  # of a file, in the common file systems
 _SILENT_S = 1.0  # of the force sensor while a camera goes on
 _RELAX_S = 1.0  # after a touch no frame shows the gel at rest: it relaxes, and stamps may be late
-_NEVER_NS = np.iinfo(np.int64).max
+_NEVER_NS = int(np.iinfo(np.int64).max)
 _LATE_S = 1.0  # for frames that a link delivers when their contact is over
 _IDLE_S = 0.002  # between looks at the devices; a tenth of the fastest camera's period
 
@@ -118,8 +118,9 @@ def record_session(
     for stream in streams:
         _require_names(config, stream.sensor)
     require_own(out)
-    report = Report(view_dropped=view is not None and not complete_view(out, config.object_id, view))
-    with RecordWriter(out, meta=_meta(config, streams), resume=True) as writer:
+    meta = _meta(config, streams)
+    report = Report(view_dropped=view is not None and not complete_view(out, meta, config.object_id, view))
+    with RecordWriter(out, meta=meta, resume=True) as writer:
         journals = out / JOURNALS
         journals.mkdir(exist_ok=True)
         book = Book(writer, journals, report)
@@ -190,6 +191,7 @@ class _Session:
         self._alarm = ""
         self._force_ns: int | None = None  # time of its last reading
         self._touched_ns = 0  # time of the last reading of a touch
+        self._rest_ns = (0, 0)  # since and until when the gel was last at rest
 
     def contact(self, stage: ContactStage, key: ContactKey) -> None:
         """Record one contact from the prompt to the records."""
@@ -210,7 +212,7 @@ class _Session:
         for stream in self._streams:
             stream.end()
         self._book.store(path)
-        if failure is not None:
+        if failure is not None and over_ns is None:  # else the next contact meets it, if one is wanted
             raise failure
 
     def _run(
@@ -225,7 +227,7 @@ class _Session:
             times, forces = self._forces(looked, journal)
             for at, one in zip(times, forces, strict=True):
                 advice = coach.step(int(at), one)
-                self._touched_ns = int(at) if self._touches(advice) else self._touched_ns
+                self._note_touch(int(at), advice)
                 if advice.recording and advice.phase != phase:
                     phase = advice.phase
                     journal.append("phase", {"time_ns": int(at), "phase": int(phase)})
@@ -247,10 +249,9 @@ class _Session:
         """Read on for frames of a contact that is over: a link may be late, though its stamps are right."""
         end_s = time.monotonic() + _LATE_S
         while not self._stop() and time.monotonic() < end_s:
-            late = [s for s in self._streams if 0 < over_ns - s.seen_ns < _LATE_S * NS_PER_S]
-            if not late:
+            if not any(0 < over_ns - stream.seen_ns < _LATE_S * NS_PER_S for stream in self._streams):
                 return
-            for stream in late:
+            for stream in self._streams:  # also those in time, whose rings would overflow
                 samples = stream.look()
                 kept = stream.time_ns(samples) <= over_ns
                 stream.journal([s for s, keep in zip(samples, kept, strict=True) if keep], journal)
@@ -261,10 +262,7 @@ class _Session:
     def _take(self, looked: Seq[list[Sample]], advice: Advice | None, journal: JournalWriter) -> None:
         """Journal the frames of a contact and those just before it; the untouched ones are the background."""
         recording = advice is not None and (advice.recording or advice.done)
-        rest_ns = None
-        if self._force is not None or self._leads is not None:
-            touched = advice is None or self._touches(advice)
-            rest_ns = _NEVER_NS if touched else self._touched_ns + round(_RELAX_S * NS_PER_S)
+        rest_ns = None if self._force is None and self._leads is None else self._rest_ns
         for stream, samples in zip(self._streams, looked, strict=True):
             stream.refresh(samples, rest_ns=rest_ns)
             if recording:
@@ -272,8 +270,13 @@ class _Session:
             else:
                 stream.keep(samples)
 
-    def _touches(self, advice: Advice) -> bool:
-        return abs(advice.normal_n) >= self._config.coach.touch_n
+    def _note_touch(self, time_ns: int, advice: Advice) -> None:
+        """Begin or end the time at rest, to which frames that come later may belong."""
+        if abs(advice.normal_n) >= self._config.coach.touch_n:
+            self._touched_ns = time_ns
+            self._rest_ns = (self._rest_ns[0], min(self._rest_ns[1], time_ns))
+        elif self._rest_ns[1] != _NEVER_NS and time_ns - self._touched_ns >= _RELAX_S * NS_PER_S:
+            self._rest_ns = (self._touched_ns + round(_RELAX_S * NS_PER_S), _NEVER_NS)
 
     def _forces(self, looked: Seq[list[Sample]], journal: JournalWriter) -> tuple[np.ndarray, np.ndarray]:
         """Times [n] and forces [n, 3] on the gel: the force sensor's, else those that a tactile sensor tells."""

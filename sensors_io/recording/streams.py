@@ -67,6 +67,7 @@ class Stream:
         self._number = number
         self._before: collections.deque[Sample] = collections.deque(maxlen=_BEFORE)
         self._background = GelBackground()
+        self._early: np.ndarray | None = None  # the gel at rest before the camera settled, for want of a later one
         self._drift: Drift | None = None
         self._disconnects, self._settled_ns = -1, 0  # -1: not even opened yet
         self._newest: Sample | None = None
@@ -93,22 +94,29 @@ class Stream:
         """Keep frames that belong to no contact, the last few of them, in case one begins."""
         self._before.extend(samples)
 
-    def refresh(self, samples: list[Sample], *, rest_ns: int | None) -> None:
+    def refresh(self, samples: list[Sample], *, rest_ns: tuple[int, int] | None) -> None:
         """Refresh the background by what shows the gel at rest.
 
         Args:
           samples: of the last look.
-          rest_ns: from which on it does, by the force; `None` where there is none and the pictures must tell.
+          rest_ns: since and until when it was, by the force; `None` where there is none and the pictures must tell.
         """
         times = self.time_ns(samples).tolist()
         if samples and self.feed.counts.disconnects != self._disconnects:
             self._disconnects, self._settled_ns = self.feed.counts.disconnects, times[0] + round(_SETTLE_S * NS_PER_S)
         for time_ns, sample in zip(times, samples, strict=True):
-            if sample.frame is not None and sample.frame.ndim == 3 and time_ns >= self._settled_ns:
-                seen = self._background.looks_touched(sample.frame) if rest_ns is None else time_ns < rest_ns
-                self._background.offer(sample.frame, touched=seen)
-                if not seen and self._background.frames % _DRIFT_EVERY == 0:
-                    self._drift = self._background.drift()
+            if sample.frame is None or sample.frame.ndim != 3:
+                continue
+            if rest_ns is None:
+                touched = self._background.looks_touched(sample.frame)
+            else:
+                touched = not rest_ns[0] <= time_ns < rest_ns[1]
+            if time_ns < self._settled_ns:
+                self._early = self._early if touched else sample.frame
+                continue
+            self._background.offer(sample.frame, touched=touched)
+            if not touched and self._background.frames % _DRIFT_EVERY == 0:
+                self._drift = self._background.drift()
 
     def journal(self, samples: list[Sample], journal: JournalWriter) -> None:
         """Journal frames of a contact, behind those just before it."""
@@ -129,7 +137,7 @@ class Stream:
     @property
     def background(self) -> np.ndarray | None:
         """The gel at rest, uint8 [H, W, 3]; `None` before it was seen."""
-        return self._background.picture() if self._background.frames else None
+        return self._background.picture() if self._background.frames else self._early
 
     @property
     def alarm(self) -> str:

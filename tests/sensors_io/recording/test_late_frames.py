@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from sensors_io.devices.errors import StreamEndedError
 from sensors_io.recording.coach import protocol
 from sensors_io.recording.session import record_session
 from sensors_io.records import RecordStore
@@ -17,11 +18,11 @@ from tests.sensors_io.recording.test_session import CONFIG, SHORT
 class Held(Camera):
     """Each frame arrives .4 s after it was taken, with a right stamp."""
 
-    waiting = ()
+    waiting, looks = (), 40
 
     def drain(self):
         self.waiting = (*self.waiting, *super().drain())
-        arrived, self.waiting = self.waiting[:-40], self.waiting[-40:]
+        arrived, self.waiting = self.waiting[: -self.looks], self.waiting[-self.looks :]
         return list(arrived)
 
 
@@ -38,7 +39,10 @@ def test_frames_that_come_when_their_contact_is_over_belong_to_it(tmp_path):
         assert -made.force_n[-1, 2] == pytest.approx(0.0 if i else 20.0, abs=1.1)
 
 
-def test_late_frames_of_a_touch_are_not_taken_for_the_gel_at_rest(tmp_path):
+@pytest.mark.parametrize("clear_s", [0.5, 1.0])
+def test_late_frames_of_a_touch_are_not_taken_for_the_gel_at_rest(tmp_path, clear_s):
+    """Those of the gel at rest are, though they come in the middle of the next touch."""
+
     class Lit(Held):
         """Its pictures are bright while something touches the gel."""
 
@@ -48,11 +52,59 @@ def test_late_frames_of_a_touch_are_not_taken_for_the_gel_at_rest(tmp_path):
             return [dataclasses.replace(s, frame=self.shown[s.host_time_ns - 10 * MS]) for s in super().drain()]
 
     hand = Hand()
-    coach = dataclasses.replace(CONFIG.coach, clear_s=1.0)
+    coach = dataclasses.replace(CONFIG.coach, clear_s=clear_s)
     config = dataclasses.replace(CONFIG, stages=protocol()[:4], coach=coach)
     assert record_session(tmp_path, config, [Lit(hand)], Scale(hand), show=hand.show).contacts == 4
-    for picture in sorted((tmp_path / "backgrounds").iterdir()):
-        assert cv2.imread(str(picture)).max() == 0
+    pictures = [cv2.imread(str(picture)) for picture in (tmp_path / "backgrounds").iterdir()]
+    assert len(pictures) == 4
+    assert not np.any(pictures)
+
+
+def test_other_sensors_are_read_while_late_frames_are_waited_for(tmp_path):
+    """Else their rings would overflow."""
+
+    class Timed(Camera):
+        def drain(self):
+            self.read_at = [*getattr(self, "read_at", []), self.hand.time_ns]
+            return []
+
+    hand = Hand()
+    other = Timed(hand, "digit")
+    record_session(tmp_path, SHORT, [Held(hand), other], Scale(hand), show=hand.show)
+    assert np.diff(other.read_at).max() <= 10 * MS
+
+
+def test_a_replay_that_ends_when_the_last_contact_is_over_ended_in_time(tmp_path):
+    class Ending(Held):
+        looks = 4
+
+        def drain(self):
+            if self.hand.contacts == 2:
+                raise StreamEndedError("the recording is over")
+            return super().drain()
+
+    hand = Hand()
+    report = record_session(tmp_path, SHORT, [Ending(hand)], Scale(hand), show=hand.show)
+    assert (report.contacts, report.ended) == (2, "")
+
+
+def test_one_early_picture_is_the_gel_at_rest_for_want_of_a_later_one(tmp_path):
+    class Still(Camera):
+        """Gives a picture when it changes, as a simulated sensor whose repeated pictures are dropped."""
+
+        lit = None
+
+        def drain(self):
+            lit, self.lit = self.lit, self.hand.force_n >= 0.1
+            samples = super().drain()
+            frame = np.full((4, 6, 3), 200 * self.lit, np.uint8)
+            return [dataclasses.replace(s, frame=frame, index=None) for s in samples if lit != self.lit]
+
+    hand = Hand()
+    record_session(tmp_path, SHORT, [Still(hand)], Scale(hand), show=hand.show)
+    pictures = [cv2.imread(str(picture)) for picture in (tmp_path / "backgrounds").iterdir()]
+    assert len(pictures) == 2
+    assert not np.any(pictures)
 
 
 @pytest.mark.parametrize("free_s", [0.0, 3.0])

@@ -254,6 +254,13 @@ def test_a_view_completes_the_card_of_an_object_and_a_second_one_is_said_to_be_d
     assert RecordStore(tmp_path).objects["cup"].view[0, 0].tolist() == [90, 90, 90]
 
 
+def test_records_that_are_refused_get_no_view(tmp_path):
+    session(tmp_path, Hand(), SHORT)
+    view, other = ObjectView(picture=np.zeros((6, 8, 3), np.uint8)), dataclasses.replace(SHORT, licence="CC0")
+    refused(RecordsExistError, "not 'CC0'", session, tmp_path, Hand(), other, view=view)
+    assert RecordStore(tmp_path).objects["cup"].view is None
+
+
 def test_a_force_sensor_out_of_its_range_is_an_alarm_and_a_flag(tmp_path):
     class Strained(Scale):
         def drain(self):
