@@ -35,8 +35,8 @@ from experiments.study.stages import (
 from experiments.study.training import (
     DECODER,
     TrainingConfig,
+    algorithm_name,
     open_data,
-    preset_name,
     require_derived,
     require_encoder,
     starting_model,
@@ -131,7 +131,7 @@ def run_study(
       ValueError, RewardError, SizeError, EncoderError: as `check_arms`, `check_model` and `require_encoder`.
     """
     if arms.keys() <= algorithms.keys() and config.grpo.algorithm != Paper():
-        given = preset_name(GRPOConfig(algorithm=config.grpo.algorithm))
+        given = algorithm_name(config.grpo.algorithm)
         raise ConfigurationError(f"grpo.algorithm is {given}: no arm trains by it, for each has its own; leave it out")
     check_arms({arm: {**weights, **config.more_rewards} for arm, weights in arms.items()}, variants)
     check_model(config.model, SENSORS)

@@ -4,8 +4,9 @@ import dataclasses
 import enum
 import hashlib
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 from experiments.core.concurrency import SEED_BYTES
 from experiments.core.context import Context
@@ -23,7 +24,7 @@ from touchr1_jax.distributed.processes import GIB
 from touchr1_jax.models.lora import LoraConfig
 from touchr1_jax.models.pretrained import load_encoder
 from touchr1_jax.models.touch_policy import TouchConfig
-from touchr1_jax.rl.config import Algorithm, AnyAlgorithm, GRPOConfig
+from touchr1_jax.rl.config import AnyAlgorithm, GRPOConfig
 from touchr1_jax.text.language import TOUCH_LANGUAGE
 from touchr1_jax.training.linear_probe import ProbeConfig
 from touchr1_jax.training.loop import LoopConfig
@@ -226,11 +227,17 @@ def starting_model(model: M, encoder: Path | None, sensors: tuple[str, ...]) -> 
 
 def preset_name(config: GRPOConfig) -> str:
     """Name of the algorithm's preset, and what differs from it and from the default sizes, as reports print it."""
-    algorithm, preset = config.algorithm, type(config.algorithm)()
-    names = [f.name for f in dataclasses.fields(Algorithm)]
-    word = lambda value: value.value if isinstance(value, enum.Enum) else value
-    changes = [f"{f}={word(getattr(algorithm, f))}" for f in names if getattr(algorithm, f) != getattr(preset, f)]
-    default = GRPOConfig(algorithm=algorithm)
-    names = [f.name for f in dataclasses.fields(GRPOConfig) if f.name != "algorithm"]
-    changes += [f"{f}={getattr(config, f)}" for f in names if getattr(config, f) != getattr(default, f)]
+    sizes = {f.name: f.default for f in dataclasses.fields(GRPOConfig) if f.name != "algorithm"}
+    return algorithm_name(config.algorithm, _changes(config, sizes))
+
+
+def algorithm_name(algorithm: AnyAlgorithm, further: Sequence[str] = ()) -> str:
+    """Name of an algorithm's preset, and what differs from it, with `further` changes."""
+    changes = [*_changes(algorithm, vars(type(algorithm)())), *further]
     return " ".join([type(algorithm).__name__.lower(), *([f"with {', '.join(changes)}"] if changes else [])])
+
+
+def _changes(config: object, defaults: Mapping[str, Any]) -> list[str]:
+    word = lambda value: value.value if isinstance(value, enum.Enum) else value
+    now = {name: getattr(config, name) for name in defaults}
+    return [f"{name}={word(now[name])}" for name, default in defaults.items() if now[name] != default]

@@ -203,3 +203,7 @@ def test_reports_name_the_preset_and_what_differs():
     changed = GRPOConfig(algorithm=Stable(gamma=0.0, tactile_use=TactileUse.OFF), prompts=4)
     assert preset_name(changed) == "stable with gamma=0.0, tactile_use=off, prompts=4"
     assert preset_name(GRPOConfig(algorithm=DrGrpo())) == "drgrpo"
+    # neither algorithm fits the default sizes
+    assert preset_name(GRPOConfig(group=16, algorithm=DrGrpo(best_of=8))) == "drgrpo with best_of=8, group=16"
+    parts = GRPOConfig(prompts=12, micro_prompts=2, algorithm=DrGrpo(minibatches=3))
+    assert preset_name(parts) == "drgrpo with minibatches=3, prompts=12, micro_prompts=2"
