@@ -295,7 +295,7 @@ def _execute(experiment: Experiment[Any], command: Any, about: str, typed: str) 
         numerics.require_supported()
         require_memory({})
         make_folder(command.cache_dir / COMPILED, "cache-dir", command.cache_dir)
-        processes = join_processes(command.launch)
+        processes = join_processes(command.launch, command.cache_dir / COMPILED)
         common = {"experiment": experiment.name, "config": jsonable(command.config), "code": runs.code_digest()}
         common |= {"processes": processes.count, "versions": runs.versions()}
         common |= {"settings": numerics.settings(), "mesh": jsonable(command.launch.mesh)}

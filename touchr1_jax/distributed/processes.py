@@ -9,11 +9,13 @@ All must see the same run and cache directories, as over a network file system.
 
 import contextlib
 import dataclasses
+import fcntl
 import json
 import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -37,7 +39,7 @@ MESSAGE_BYTES = 8192
 
 
 class ProcessesNotFoundError(RuntimeError):
-    """The other processes of a distributed run cannot be found."""
+    """The other processes of a distributed run cannot be found, or one of them has the number of this one."""
 
 
 class MachineError(Exception):
@@ -180,16 +182,24 @@ def say(text: str) -> None:
         os.write(STDERR, f"{text}\n".encode())
 
 
-def join_processes(launch: Launch, say_s: float = SAY_S, wait_s: float = WAIT_S) -> ProcessGroup:
+def join_processes(
+    launch: Launch, folder: Path | None = None, say_s: float = SAY_S, wait_s: float = WAIT_S
+) -> ProcessGroup:
     """Join the processes of a run; must come before any computation.
 
     After `say_s` seconds standard error names what is waited for; after `wait_s` the process ends with status 1.
 
+    Args:
+      folder: shared by all processes; there each locks its number, where the launch gives one.
+
     Raises:
-      ProcessesNotFoundError: a distributed run without an address, and no cluster that JAX knows to name one.
+      ProcessesNotFoundError: a distributed run without an address, and no cluster that JAX knows to name one; another
+        process has this one's number.
     """
     if not launch.distributed:
         return SINGLE_PROCESS
+    if folder is not None and launch.coordinator is not None:
+        _lock_number(launch, folder)
     try:
         with coordination_apart(), _announced(launch, say_s, wait_s):
             later = round(2 * wait_s)
@@ -201,6 +211,19 @@ def join_processes(launch: Launch, say_s: float = SAY_S, wait_s: float = WAIT_S)
             "Kubernetes job, or give --coordinator HOST:PORT --processes N --process I in each"
         ) from error
     return ProcessGroup(jax.process_count(), jax.process_index())
+
+
+def _lock_number(launch: Launch, folder: Path) -> None:
+    """Lock the number of a process until it ends: where two have one, JAX aborts all of them with a stack of C++."""
+    name = f".process-{launch.process}-of-{launch.coordinator}".replace("/", "_")
+    number = os.open(folder / name, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC)
+    try:
+        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise ProcessesNotFoundError(
+            f"process is {launch.process}: another process has this number in the run at {launch.coordinator}; give "
+            f"each its own, 0 … {(launch.processes or 1) - 1}, or wait for the other to end"
+        ) from None
 
 
 def select_devices(launch: Launch) -> SingleDevice:

@@ -1,6 +1,7 @@
 """Processes of a run: who writes, what each reads, the figures of one process; accelerators that a scale needs."""
 
 import dataclasses
+import fcntl
 import json
 import os
 import signal
@@ -87,6 +88,18 @@ def test_one_process_asks_no_other(monkeypatch):
     assert SINGLE_PROCESS.any(True)
     assert not SINGLE_PROCESS.any(False)
     assert SINGLE_PROCESS.split_work(np.arange(3), lambda rows: rows + 1).tolist() == [1, 2, 3]
+
+
+def test_a_number_that_another_process_has_is_refused_before_jax_aborts_both(tmp_path, capsys):
+    """Before, a follower or leader that was started twice ended the whole run in a stack of C++."""
+    folders = ["--runs-dir", str(tmp_path / "runs"), "--cache-dir", str(tmp_path)]
+    launch = ["--distributed", "--coordinator", "127.0.0.1:1", "--processes", "2", "--process", "1"]
+    (tmp_path / "compiled").mkdir()
+    with (tmp_path / "compiled" / ".process-1-of-127.0.0.1:1").open("w") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        assert main(["small_study", "--scale", "short", *launch, *folders], package=PACKAGE) == 1
+    assert "process is 1: another process has this number in the run at 127.0.0.1:1" in capsys.readouterr().err
+    assert not (tmp_path / "runs").exists()
 
 
 @pytest.mark.long
