@@ -187,7 +187,7 @@ def _tell_losses(object_id: str, report: Report) -> None:
             OUT.print(f"{count} frames {problem}", highlight=False, soft_wrap=True)
     if report.view_dropped:
         OUT.print(
-            f"{object_id} keeps its first view: --contact-mm must be in the frame of the camera of then",
+            f"{object_id} has a view from an earlier session, which is kept: give --contact-mm in that picture's frame",
             highlight=False,
             soft_wrap=True,
         )

@@ -19,9 +19,8 @@ from sensors_io.layer import Layer
 from sensors_io.quality import QualityConfig, saturated
 from sensors_io.schema import Flag, SchemaError, Spec, check_arrays
 
-_OTHER_GEL_LEVELS = (
-    15.0  # three Minis differ by 4 to 6; swapped channels, a turned picture, 1.2 × the light by 20 to 29
-)
+_OTHER_GEL_LEVELS = 15.0
+"""Three Minis differ by 4 to 6 levels; swapped channels, a turned picture or 1.2 × the light by 20 to 29."""
 
 
 class OtherGelWarning(UserWarning):
