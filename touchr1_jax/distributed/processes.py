@@ -10,6 +10,7 @@ All must see the same run and cache directories, as over a network file system.
 import contextlib
 import dataclasses
 import fcntl
+import glob
 import json
 import os
 import signal
@@ -214,16 +215,36 @@ def join_processes(
 
 
 def _lock_number(launch: Launch, folder: Path) -> None:
-    """Lock the number of a process until it ends: where two have one, JAX aborts all of them with a stack of C++."""
-    name = f".process-{launch.process}-of-{launch.coordinator}".replace("/", "_")
-    number = os.open(folder / name, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC)
-    try:
-        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
+    """Lock the number of a process until it ends, with the number of processes that it was given.
+
+    Where two have one number, or one states fewer processes than there are, JAX aborts with a stack of C++.
+    """
+    address = f"-of-{launch.coordinator}".replace("/", "_")
+    number = os.open(folder / f".process-{launch.process}{address}", os.O_CREAT | os.O_RDWR | os.O_CLOEXEC)
+    if not _locks(number):
         raise ProcessesNotFoundError(
             f"process is {launch.process}: another process has this number in the run at {launch.coordinator}; give "
             f"each its own, 0 … {(launch.processes or 1) - 1}, or wait for the other to end"
-        ) from None
+        )
+    os.ftruncate(number, 0)
+    os.pwrite(number, str(launch.processes).encode(), 0)
+    for path in folder.glob(f".process-*{glob.escape(address)}"):
+        with path.open("r+") as other:  # a network file system locks what may be written alone
+            stated = other.read()
+            if stated not in ("", str(launch.processes)) and not _locks(other.fileno()):
+                raise ProcessesNotFoundError(
+                    f"processes is {launch.processes}: another process of the run at {launch.coordinator} was given "
+                    f"{stated}; give all the same --processes, and each its own --process"
+                )
+
+
+def _locks(number: int) -> bool:
+    """Lock an open file; false where another process has locked it."""
+    try:
+        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def select_devices(launch: Launch) -> SingleDevice:

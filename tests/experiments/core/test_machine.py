@@ -90,15 +90,28 @@ def test_one_process_asks_no_other(monkeypatch):
     assert SINGLE_PROCESS.split_work(np.arange(3), lambda rows: rows + 1).tolist() == [1, 2, 3]
 
 
-def test_a_number_that_another_process_has_is_refused_before_jax_aborts_both(tmp_path, capsys):
-    """Before, a follower or leader that was started twice ended the whole run in a stack of C++."""
+@pytest.mark.parametrize(
+    ("number", "stated", "refusal"),
+    [
+        (1, "2", "process is 1: another process has this number in the run at 127.0.0.1:1"),
+        (0, "3", "processes is 2: another process of the run at 127.0.0.1:1 was given 3"),
+        (2, "3", "processes is 2: another process of the run at 127.0.0.1:1 was given 3"),
+    ],
+)
+def test_numbers_that_do_not_fit_another_process_are_refused_before_jax_aborts_all(
+    number, stated, refusal, tmp_path, capsys
+):
+    """Before, a process that was started twice, or one too many, ended processes in a stack of C++."""
     folders = ["--runs-dir", str(tmp_path / "runs"), "--cache-dir", str(tmp_path)]
     launch = ["--distributed", "--coordinator", "127.0.0.1:1", "--processes", "2", "--process", "1"]
     (tmp_path / "compiled").mkdir()
-    with (tmp_path / "compiled" / ".process-1-of-127.0.0.1:1").open("w") as other:
+    (tmp_path / "compiled" / ".process-7-of-127.0.0.1:1").write_text("8")  # of a run that has ended
+    with (tmp_path / "compiled" / f".process-{number}-of-127.0.0.1:1").open("w") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
+        other.write(stated)
+        other.flush()
         assert main(["small_study", "--scale", "short", *launch, *folders], package=PACKAGE) == 1
-    assert "process is 1: another process has this number in the run at 127.0.0.1:1" in capsys.readouterr().err
+    assert refusal in capsys.readouterr().err
     assert not (tmp_path / "runs").exists()
 
 
