@@ -101,7 +101,7 @@ def reliability(votes: Votes, bins: int = 10) -> tuple[Bin, ...]:
 
     A bin holds its lower end, the last one both; in the source of `calibration_error` a bin holds its upper end.
     """
-    place = np.minimum((votes.confidence * bins).astype(int), bins - 1)
+    place = np.minimum((votes.confidence * bins + 1e-9).astype(int), bins - 1)  # 100 · 29/50 rounds to below 58
     found = [place == b for b in np.unique(place)]
     return tuple(Bin(float(votes.confidence[at].mean()), float(votes.right[at].mean()), int(at.sum())) for at in found)
 

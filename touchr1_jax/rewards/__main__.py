@@ -223,8 +223,6 @@ def terms_table(
 
     def of_rollout(tokens: Array, parsed: Parsed, target: Target) -> tuple[Array, Mapping[str, Array], Mapping]:
         total, parts = total_reward(rewards, weights, parsed, target, tokens, write)
-        sensors, attributes = parsed.perceive.shape
-        prove_rewards(rewards, weights, sensors, attributes, longest)
         values = {n: reward_value(n, rewards[n], parsed, target, tokens, write) for n in weights}
         terms = {n: (values[n], rewards[n].applies(target)) for n in weights}
         return total, parts, terms
@@ -237,6 +235,7 @@ def terms_table(
 
     for slot, target in targets:
         total, parts, terms = score(target)
+        prove_rewards(rewards, weights, len(parsed.perceive), tuple(target.levels.tolist()), longest)
         for name, weight in weights.items():
             value, applies = terms[name]
             shown = f"{float(value):.3f}" if applies else NOT_DEFINED

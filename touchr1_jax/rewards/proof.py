@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import itertools
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import jax
@@ -27,7 +27,7 @@ IMPURE = (
 
 
 def prove_rewards(
-    rewards: Mapping[str, AnyReward], names: Iterable[str], sensors: int, attributes: int, length: int = 20
+    rewards: Mapping[str, AnyReward], names: Iterable[str], sensors: int, levels: tuple[int, ...], length: int = 20
 ) -> None:
     """Evaluate rewards on extreme answers and targets; once for each reward and size.
 
@@ -36,13 +36,14 @@ def prove_rewards(
 
     Answers: every slot ⊥, lowest or highest, or sensors that disagree; formatted or not, cut off or not, of no, one or
     twenty tokens.  Targets: no attribute asked, one or all; labels unknown, lowest or highest of two, three or nine
-    levels; ordinal or not; no sensor, one, two or all.  A host reward is not checked: if it is NaN,
-    its group is left out.
+    levels; ordinal or not; no sensor, one, two or all.  Indices are those of the lowest and of the highest level that
+    each attribute has.  A host reward is not checked: if it is NaN, its group is left out.
 
     Args:
       rewards: the choices, by name.
       names: those to check.
-      sensors, attributes: S and A.
+      sensors: S.
+      levels: number of levels of each attribute; 1 where it is unknown.
       length: T, tokens of a completion.
 
     Raises:
@@ -52,7 +53,7 @@ def prove_rewards(
     for name in names:
         if not isinstance(rewards[name], HostReward):
             require_hash(f"reward {name!r}", rewards[name])
-            _prove(name, rewards[name], sensors, attributes, length)
+            _prove(name, rewards[name], sensors, levels, length)
 
 
 def require_hash(what: str, reward: object) -> None:
@@ -69,13 +70,13 @@ def require_hash(what: str, reward: object) -> None:
 
 
 @functools.cache
-def _prove(name: str, reward: Reward | GroupReward, sensors: int, attributes: int, length: int) -> None:
+def _prove(name: str, reward: Reward | GroupReward, sensors: int, levels: tuple[int, ...], length: int) -> None:
     with jax.ensure_compile_time_eval():
-        answers, targets = _answers(sensors, attributes), _targets(sensors, attributes)
+        answers, targets = _answers(sensors, len(levels)), _targets(sensors, len(levels))
         of_all = jax.jit(lambda answers, targets: _values(reward, answers, targets, length))
         values = np.asarray(of_all(answers, targets))
         _require_finite(name, values, answers, targets)
-        _require_pure(name, reward, answers, targets, length)
+        require_pure(f"reward {name!r}", reward.value, *_cases(reward, sensors, np.array(levels, np.int32), length))
         if isinstance(reward, Reward) and reward.settled != SEGMENTS[-1]:
             changed = np.asarray(of_all(_changed_after(reward.settled, answers), targets))
             if not np.allclose(values, changed, rtol=1e-4, atol=1e-6):  # up to rounding
@@ -88,46 +89,55 @@ def _prove(name: str, reward: Reward | GroupReward, sensors: int, attributes: in
 def _require_finite(name: str, values: np.ndarray, answers: Parsed, targets: Target) -> None:
     bad = np.argwhere(~np.isfinite(values))
     if len(bad):
-        a, t = bad[0]
+        alone, a, t = bad[0]
         plain = lambda tree, i: jax.tree.map(lambda x: np.asarray(x)[i].tolist(), tree)
         raise RewardError(
-            f"reward {name!r} is {values[a, t]} for {plain(answers, a)} against {plain(targets, t)}: must be finite "
-            "everywhere; choose with jnp.where before you divide or take logarithms"
+            f"reward {name!r} is {values[alone, a, t]} for {plain(answers, a)}{' in a group of one' * int(alone)} "
+            f"against {plain(targets, t)}: must be finite everywhere; choose with jnp.where before you divide or take "
+            "logarithms"
         )
 
 
-def _require_pure(name: str, reward: Reward | GroupReward, answers: Parsed, targets: Target, length: int) -> None:
-    """`require_pure` for levels that every attribute has."""
-    lowest = int(np.argmax(np.asarray(answers.compare)[:, 0] == 0))
-    alike = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x)[lowest], x.shape), answers)
-    one, target = (jax.tree.map(lambda x: np.asarray(x)[0], tree) for tree in (alike, targets))
-    of = (one,) if isinstance(reward, Reward) else (np.zeros((len(alike.length), length), np.int32), alike)
-    require_pure(f"reward {name!r}", reward.value, *of, target)
+def _cases(reward: Reward | GroupReward, sensors: int, levels: Any, length: int) -> Iterator[tuple[Any, ...]]:
+    """Arguments of a reward: all attributes asked, or one, with the lowest or highest levels, no or all tokens."""
+    each: Any = itertools.product((0 * levels, levels - 1), (0, length), (levels > 0, *np.eye(len(levels), dtype=bool)))
+    array: Any = np.array  # these are no arrays of JAX, to compile nothing
+    for level, tokens, asked in each:
+        slots, ended, number = array([level] * sensors), array(tokens < length), array(tokens, np.int32)
+        answer = Parsed(slots, level, level, formatted=ended, truncated=~ended, length=number)
+        target = Target(asked, level, levels, ordinal=levels > 0, streams=array([True] * sensors))
+        if isinstance(reward, GroupReward):
+            yield np.zeros((2, length), np.int32), jax.tree.map(lambda x: np.stack([x, x]), answer), target
+        else:
+            yield answer, target
 
 
-def require_pure(what: str, value: Callable[..., Any], *of: Any) -> None:
+def require_pure(what: str, value: Callable[..., Any], *cases: tuple[Any, ...]) -> None:
     """Trace a reward twice; if it looks elements up, check their indices.
 
     Args:
       what: what an error calls it.
       value: the function.
-      of: its arguments, a `Target` among them.
+      cases: its arguments, of equal shapes, each time with a `Target`.
 
     Raises:
       RewardError: another function each time, or an index beyond an array.
     """
-    once, again = written(value, *of), written(value, *of)
+    once, again = written(value, *cases[0]), written(value, *cases[0])
     if once != again:
         raise RewardError(f"{what} {IMPURE}; compute from the arguments alone")
     if not re.search(r"\b(gather|dynamic_slice)\[", once[0]):  # a constant index inside its array needs neither
         return
-    outside = jax.jit(checkify.checkify(value, errors=checkify.index_checks))(*of)[0].get()
-    if outside:
-        sensors, attributes = next((len(x.streams), len(x.label)) for x in of if isinstance(x, Target))
-        raise RewardError(
-            f"{what}: {outside.splitlines()[0].split(': ', 1)[-1].rstrip('. ')}: must lie inside, or a step "
-            f"reads another element; bound it by jnp.clip: there are {sensors} sensors and {attributes} attributes"
-        )
+    checked = jax.jit(checkify.checkify(value, errors=checkify.index_checks))
+    for of in cases:
+        if outside := checked(*of)[0].get():
+            target = next(x for x in of if isinstance(x, Target))
+            levels = ", ".join(map(str, np.asarray(target.levels).tolist()))
+            raise RewardError(
+                f"{what}: {outside.splitlines()[0].split(': ', 1)[-1].rstrip('. ')}: must lie inside, or a step reads "
+                f"another element; bound it by jnp.clip: there are {len(target.streams)} sensors, and attributes of "
+                f"{levels} levels"
+            )
 
 
 def written(value: Callable[..., Any], *of: Any) -> tuple[str, list[bytes]]:
@@ -147,7 +157,7 @@ def _changed_after(segment: str, answers: Parsed) -> Parsed:
 
 
 def _values(reward: Reward | GroupReward, answers: Parsed, targets: Target, length: int) -> Array:
-    """Value of every answer against every target, [answers, targets]; of a `GroupReward`, among all and alone."""
+    """Value of every answer against every target, in a group of all answers and alone, [2, answers, targets]."""
     tokens = jnp.tile(jnp.arange(len(answers.length))[:, None], (1, length))
 
     def of_group(tokens: Array, answers: Parsed, target: Target) -> Array:
@@ -161,7 +171,7 @@ def _values(reward: Reward | GroupReward, answers: Parsed, targets: Target, leng
     over_targets = jax.vmap(of_group, in_axes=(None, None, 0), out_axes=-1)
     one_by_one = jax.tree.map(lambda x: x[:, None], answers)
     alone = jax.vmap(over_targets, in_axes=(0, 0, None))(tokens[:, None], one_by_one, targets)
-    return over_targets(tokens, answers, targets) + alone[:, 0]
+    return jnp.stack([over_targets(tokens, answers, targets), alone[:, 0]])
 
 
 def _answers(sensors: int, attributes: int) -> Parsed:

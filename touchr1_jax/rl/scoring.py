@@ -84,7 +84,8 @@ class WeightedScore:
         parsed = self.parser(tokens)
         reward, terms = total_reward(self.rewards, self.weights, parsed, target, tokens, self.decode)
         sensors, attributes = parsed.perceive.shape
-        prove_rewards(self.rewards, self.weights, sensors, attributes, tokens.shape[-1])
+        levels = self.parser.levels if isinstance(self.parser, Parser) else (1,) * attributes
+        prove_rewards(self.rewards, self.weights, sensors, levels, tokens.shape[-1])
         return reward, terms, parsed
 
     def segment_advantages(

@@ -63,7 +63,8 @@ def check_touch_reward(reward: TouchReward, prices: Prices, target: Target, outc
             raise RewardError(f"prices.{name} is {float(price)}: must be finite and ≥ 0; correct it")
     require_hash("the reward", reward)
     one, nothing = (jax.tree.map(lambda x: np.asarray(x)[0], tree) for tree in (target, _after(outcome, -1)))
-    require_pure("the reward", functools.partial(_terms, reward), np.zeros_like(one.label), one, nothing, prices)
+    each = ((level, one, nothing, prices) for level in (0 * one.levels, one.levels - 1))
+    require_pure("the reward", functools.partial(_terms, reward), *each)
     slowest = _after(outcome, np.argmax(outcome.seconds, -1))
     spent = [_after(outcome, action) for action in range(-1, outcome.seconds.shape[1])]
     spent += [Spent(*(times * total for total in slowest)) for times in range(2, budget + 1)]

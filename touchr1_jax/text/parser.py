@@ -42,6 +42,11 @@ class Parser:
     levels_of: np.ndarray  # int32 [events, A], bit k where an event names level k of an attribute
     ordinal_levels: int  # most levels of an ordinal attribute, 0 without any
 
+    @property
+    def levels(self) -> tuple[int, ...]:
+        """Number of levels of each attribute."""
+        return tuple(int(bits).bit_length() for bits in np.bitwise_or.reduce(self.levels_of, axis=0))
+
     def __call__(self, tokens: Int[Array, "*T"]) -> Parsed:
         """Parse one completion; tokens from the first end token on are ignored.
 

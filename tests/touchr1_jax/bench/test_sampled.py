@@ -81,3 +81,5 @@ def test_calibration_by_hand():
     assert reliability(votes) == (Bin(0.5, 1.0, 2), Bin(1.0, 0.5, 2))
     assert calibration_error(votes) == 0.5
     assert calibration_error(Votes(right=np.array([True, False]), confidence=np.array([0.5, 0.5]))) == 0
+    edge = Votes(right=np.array([True, False]), confidence=np.array([29 / 50, 0.585]))  # a bin holds its lower end
+    assert [b.number for b in reliability(edge, bins=100)] == [2]

@@ -13,6 +13,7 @@ from touchr1_jax.rewards import GroupReward, HostReward, Reward, RewardError, ma
 from touchr1_jax.rewards.proof import prove_rewards
 
 S, A = 4, 4
+LEVELS = 3, 3, 3, 9
 
 
 def spread_of_sensors(parsed, target):
@@ -31,7 +32,7 @@ def spread_of_group(tokens, parsed, target):
 @pytest.mark.parametrize(("levels", "sensors"), [((3, 3, 3, 9), S), ((2, 2, 2, 2), 1), ((2, 3, 5, 9), 2)])
 def test_every_reward_of_the_package_is_finite(levels, sensors):
     rewards = make_rewards(uniform_prior(levels))
-    prove_rewards(rewards, rewards, sensors, len(levels))
+    prove_rewards(rewards, rewards, sensors, levels)
 
 
 @pytest.mark.parametrize(
@@ -47,7 +48,7 @@ def test_every_reward_of_the_package_is_finite(levels, sensors):
 )
 def test_a_reward_that_is_not_finite_somewhere_is_named(reward):
     with pytest.raises(RewardError, match=r"reward 'mine' is (nan|-?inf) for .*: must be finite everywhere"):
-        prove_rewards({"mine": reward}, ["mine"], S, A)
+        prove_rewards({"mine": reward}, ["mine"], S, LEVELS)
 
 
 def test_corners_are_those_of_the_docstring():
@@ -66,7 +67,7 @@ def test_corners_are_those_of_the_docstring():
 
 
 def test_a_reward_on_the_host_is_not_called_before_training():
-    prove_rewards({"mine": HostReward(lambda text, parsed, target: np.nan)}, ["mine"], S, A)
+    prove_rewards({"mine": HostReward(lambda text, parsed, target: np.nan)}, ["mine"], S, LEVELS)
 
 
 CALLS = itertools.count(1)
@@ -84,7 +85,7 @@ CALLS = itertools.count(1)
 def test_a_reward_that_is_not_pure_is_named(reward):
     """A step would trace it once: every answer of a whole run would get the same random number."""
     with pytest.raises(RewardError, match="reward 'mine' is another function each time: must be pure"):
-        prove_rewards({"mine": reward}, ["mine"], S, A)
+        prove_rewards({"mine": reward}, ["mine"], S, LEVELS)
 
 
 @pytest.mark.parametrize(
@@ -102,23 +103,38 @@ def test_a_reward_that_is_not_pure_is_named(reward):
 def test_an_index_beyond_the_end_is_named(reward, wrong):
     """JAX would read the last element."""
     with pytest.raises(RewardError, match=f"reward 'mine': {wrong}: must lie inside.*bound it by jnp.clip"):
-        prove_rewards({"mine": reward}, ["mine"], 2, A)
+        prove_rewards({"mine": reward}, ["mine"], 2, LEVELS)
 
 
-def test_levels_may_be_looked_up():
-    table = jnp.array([[0.0, 0.5]] * A)  # of two levels
-    rewards = {
-        "one": Reward(lambda p, t: table[-1, p.conclude[-1]]),
-        "many": GroupReward(lambda tokens, p, t: table[0, p.conclude[:, 0]]),
-    }
-    prove_rewards(rewards, rewards, S, A)
+@pytest.mark.parametrize("kind", [Reward, GroupReward])
+def test_levels_may_be_looked_up(kind):
+    """A table that lacks the levels of one attribute is refused, where JAX would read the last of those that it has."""
+    short, whole = jnp.array([[0.0, 0.5, 1.0]] * A), jnp.zeros((A, 9))
+    looked_up = lambda table: kind(lambda *of: table[jnp.argmax(of[-1].asked), of[-2].conclude[..., -1]])
+    prove_rewards({"mine": looked_up(whole)}, ["mine"], S, LEVELS)
+    prove_rewards({"mine": looked_up(short)}, ["mine"], S, (3,) * A)
+    with pytest.raises(RewardError, match=r"index 8 is out of bounds for axis 1 with size 3: .* of 3, 3, 3, 9 levels"):
+        prove_rewards({"mine": looked_up(short)}, ["mine"], S, LEVELS)
+
+
+def test_an_index_by_the_longest_answer_is_checked():
+    price = jnp.array([0.0, -0.5, -1.0])
+    by_length = Reward(lambda p, t: price[jnp.searchsorted(jnp.array([5, 10, 15]), p.length)])
+    with pytest.raises(RewardError, match="index 3 is out of bounds for axis 0 with size 3"):
+        prove_rewards({"mine": by_length}, ["mine"], S, LEVELS)
+
+
+def test_a_reward_that_fails_in_a_group_of_one_says_so():
+    rank = GroupReward(lambda tokens, p, t: jnp.argsort(jnp.argsort(p.length)) / (len(p.length) - 1))
+    with pytest.raises(RewardError, match=r"reward 'mine' is nan for .* in a group of one against"):
+        prove_rewards({"mine": rank}, ["mine"], S, LEVELS)
 
 
 @pytest.mark.long
 def test_random_numbers_of_a_fixed_key_are_pure():
     """The key is a constant of the program, of a type that NumPy does not have."""
     drawn = Reward(lambda p, t: jax.random.uniform(jax.random.fold_in(jax.random.key(0), p.length)))
-    prove_rewards({"mine": drawn}, ["mine"], S, A)
+    prove_rewards({"mine": drawn}, ["mine"], S, LEVELS)
 
 
 @pytest.mark.long
@@ -131,9 +147,9 @@ def test_random_numbers_of_a_fixed_key_are_pure():
     ],
 )
 def test_a_reward_is_known_where_it_is_settled(segment, value):
-    prove_rewards({"mine": Reward(lambda p, t: 1.0 * p.perceive[0, 0], settled=segment)}, ["mine"], S, A)
+    prove_rewards({"mine": Reward(lambda p, t: 1.0 * p.perceive[0, 0], settled=segment)}, ["mine"], S, LEVELS)
     with pytest.raises(RewardError, match=f"reward 'mine' is settled by '{segment}', but what follows changes it"):
-        prove_rewards({"mine": Reward(value, settled=segment)}, ["mine"], S, A)
+        prove_rewards({"mine": Reward(value, settled=segment)}, ["mine"], S, LEVELS)
 
 
 @dataclasses.dataclass
@@ -160,4 +176,4 @@ class Prices:
 def test_a_reward_without_a_hash_is_named(reward, has_none):
     said = rf"reward 'mine': unhashable type: '{has_none}', must have a hash.*write @dataclass\(eq=False\)"
     with pytest.raises(RewardError, match=said):
-        prove_rewards({"mine": Reward(reward)}, ["mine"], S, A)
+        prove_rewards({"mine": Reward(reward)}, ["mine"], S, LEVELS)

@@ -78,6 +78,19 @@ ENDS = HostReward(lambda text, parsed, target: float(text.endswith("</conclude>"
 """1 where the text ends well, and the label of the first attribute."""
 
 
+@pytest.mark.parametrize("size", [8, 9])
+def test_a_table_of_levels_holds_those_of_every_attribute(size):
+    """The parser tells how many levels there are: of materials nine."""
+    worth = {"worth": Reward(lambda p, t: jnp.zeros(size)[p.conclude[jnp.argmax(t.asked)]])}
+    of_rollout = lambda: jax.eval_shape(make_score(PARSER, worth, {"worth": 1.0}), TOKENS[0, 0], target)
+    target = jax.tree.map(lambda x: x[0], TARGET)
+    if size == 9:
+        of_rollout()
+        return
+    with pytest.raises(RewardError, match="'worth': index 8 is out of bounds for axis 0 with size 8"):
+        of_rollout()
+
+
 @pytest.mark.long
 def test_a_reward_may_see_the_tokens_of_the_whole_group():
     score = make_score(PARSER, {"rank": RANK}, {"rank": 2.0})

@@ -55,6 +55,7 @@ FAULTS = {
         "luck": s.seconds * np.random.default_rng().random()
     },
     "the reward: .* 7 .*: must lie inside": lambda p, t, s, c: {"seventh": 1.0 * t.label[s.actions + 7]},
+    "the reward: index 2 is .* size 2: must lie inside": lambda p, t, s, c: {"two": jnp.arange(2.0)[p.conclude[0]]},
 }
 
 
