@@ -26,7 +26,7 @@ import tyro
 from rich.console import Console
 
 from experiments.core import numerics, runs, watchers
-from experiments.core.artifacts import DamagedFileError, jsonable, make_folder, read_times, require_link, write_sealed
+from experiments.core.artifacts import DamagedFileError, jsonable, make_folder, require_link, write_sealed
 from experiments.core.commands import PROG, find, print_error, print_lines, run_command
 from experiments.core.context import Context
 from experiments.core.loops import alarm_tables, left_out_tables
@@ -374,8 +374,7 @@ def _compute(
             experiment.run(command.config, context)
         return
     description = runs.read_description(directory)
-    last = runs.newest(directory.parent, description["config"], finished=True)
-    usual_s = None if last is None else read_times(last / "timing.json").get("total")
+    usual_s = watchers.usual_seconds(directory.parent, description["config"])
     page = watchers.LivePage(directory, about=about, description=description, curves=experiment.curves, usual_s=usual_s)
     try:
         events: list[watchers.Watcher] = [watchers.Events(directory / EVENTS)] if command.tensorboard else []
