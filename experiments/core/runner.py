@@ -297,7 +297,7 @@ def _execute(experiment: Experiment[Any], command: Any, about: str, typed: str) 
         make_folder(command.cache_dir / COMPILED, "cache-dir", command.cache_dir)
         processes = join_processes(command.launch, command.cache_dir / COMPILED)
         common = {"experiment": experiment.name, "config": jsonable(command.config), "code": runs.code_digest()}
-        common |= {"processes": processes.count, "versions": runs.versions()}
+        common |= {"processes": processes.count, "versions": runs.versions(), "fresh": command.fresh}
         common |= {"settings": numerics.settings(), "mesh": jsonable(command.launch.mesh)}
         with watched(processes.count, processes.index, common, fate):
             require_backend()
