@@ -32,7 +32,7 @@ class UserError(Exception):
 
 
 def require_words(args: Sequence[str]) -> None:
-    """Refuse an empty word of a command line: as a path it would be the current folder, as a name none.
+    """Refuse an empty word of a command line, which as a path would be the current folder, and ~ for the home folder.
 
     Raises:
       ValueError: naming the option before it.
@@ -41,6 +41,9 @@ def require_words(args: Sequence[str]) -> None:
         if not word or (word.startswith("--") and word.endswith("=")):
             option = word.removesuffix("=") or (before if before.startswith("--") else "an argument")
             raise ValueError(f"{option} is '': must not be empty; give its value, or leave it out")
+        path = word.partition("=")[2] if word.startswith("--") else word
+        if path == "~" or path.startswith("~/"):  # as in --out=~/records: a folder called ~ would be made here
+            raise ValueError(f"{word}: the shell leaves this ~ as it is; write the whole path, such as $HOME/…")
 
 
 def require_kept(args: Sequence[str]) -> None:

@@ -90,3 +90,30 @@ def require_wide(params: Any) -> None:
                 f"params{jax.tree_util.keystr(path)} is {x.dtype}: must be float32 where it is trained, for its "
                 "rounding swallows small updates; cast it, and set bfloat16 to compute in bfloat16, or train adapters"
             )
+
+
+def by_name(kind: type) -> Any:
+    """Annotation of a mapping that a command line gives as `NAME VALUE NAME VALUE`, each name once.
+
+    Of a name that is given twice, tyro itself takes the last value without a word.
+
+    Args:
+      kind: of the values.
+    """
+    from tyro.constructors import PrimitiveConstructorSpec  # of command lines alone
+
+    def read(words: list[str]) -> dict[str, Any]:
+        names, values = words[::2], words[1::2]
+        if len(names) > len(values):
+            raise ValueError(f"{names[-1]} has no value: must be NAME VALUE, as often as needed; add it")
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise ValueError(f"{twice[0]} is given twice: must have one value; leave one out")
+        return {name: kind(value) for name, value in zip(names, values, strict=True)}
+
+    return PrimitiveConstructorSpec(
+        nargs="*",
+        metavar=f"[NAME {kind.__name__.upper()} …]",
+        instance_from_str=read,
+        is_instance=lambda found: isinstance(found, dict),
+        str_from_instance=lambda found: [str(word) for pair in found.items() for word in pair],
+    )

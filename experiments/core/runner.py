@@ -26,7 +26,7 @@ import tyro
 from rich.console import Console
 
 from experiments.core import numerics, runs, watchers
-from experiments.core.artifacts import DamagedFileError, jsonable, make_folder, read_times, require_link, write_sealed
+from experiments.core.artifacts import DamagedFileError, jsonable, make_folder, require_link, write_sealed
 from experiments.core.commands import PROG, find, print_error, print_lines, run_command
 from experiments.core.context import Context
 from experiments.core.loops import alarm_tables, left_out_tables
@@ -297,7 +297,7 @@ def _execute(experiment: Experiment[Any], command: Any, about: str, typed: str) 
         make_folder(command.cache_dir / COMPILED, "cache-dir", command.cache_dir)
         processes = join_processes(command.launch, command.cache_dir / COMPILED)
         common = {"experiment": experiment.name, "config": jsonable(command.config), "code": runs.code_digest()}
-        common |= {"processes": processes.count, "versions": runs.versions()}
+        common |= {"processes": processes.count, "versions": runs.versions(), "fresh": command.fresh}
         common |= {"settings": numerics.settings(), "mesh": jsonable(command.launch.mesh)}
         with watched(processes.count, processes.index, common, fate):
             require_backend()
@@ -374,8 +374,7 @@ def _compute(
             experiment.run(command.config, context)
         return
     description = runs.read_description(directory)
-    last = runs.newest(directory.parent, description["config"], finished=True)
-    usual_s = None if last is None else read_times(last / "timing.json").get("total")
+    usual_s = watchers.usual_seconds(directory.parent, description["config"])
     page = watchers.LivePage(directory, about=about, description=description, curves=experiment.curves, usual_s=usual_s)
     try:
         events: list[watchers.Watcher] = [watchers.Events(directory / EVENTS)] if command.tensorboard else []

@@ -12,12 +12,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.core.artifacts import read_times, write_text
+from experiments.core.artifacts import DamagedFileError, read_times, write_text
+from experiments.core.commands import print_lines
 from experiments.core.curves import PhaseCurves, draw_phases
 from experiments.core.metric_log import read_metrics
 from experiments.core.progress import Loop, TrainingSample, Watcher
 from experiments.core.report import render
-from experiments.core.runs import continuing, point_latest
+from experiments.core.runs import continuing, newest, point_latest
 from experiments.core.text import duration
 
 PAGE_EVERY_S = 10  # least seconds between two pages, and between two reloads by a browser
@@ -168,6 +169,16 @@ class LivePage(Watcher):
         for phase, lines in rows.items():
             if self._drawn.get(phase, (0,))[0] != len(lines):
                 self._drawn[phase] = len(lines), draw_phases(lines, self._wanted, most=MOST_PANELS)
+
+
+def usual_seconds(home: Path, config: Any) -> float | None:
+    """Seconds that the newest finished run of a configuration took; of one that is damaged a note, and `None`."""
+    try:
+        last = newest(home, config, finished=True)
+        return None if last is None else read_times(last / "timing.json").get("total")
+    except DamagedFileError as error:  # of which this run needs nothing
+        print_lines(f"note: the usual time is unknown: {error}")
+        return None
 
 
 def _now() -> str:

@@ -130,10 +130,14 @@ def force_only(data: Dataset, probed: ProbeFeatures, rows: np.ndarray, config: P
 
 
 def score_study(study: Study) -> Scored:
-    """Every metric of every policy's and every baseline's answers about the test contacts."""
+    """Every metric of every policy's and every baseline's answers about the test contacts.
+
+    One about a single object is left out: no interval over objects is defined.
+    """
     answers = {**study.answers, **{name: [answers] for name, answers in baselines(study).items()}}
-    rows = {name: [score(study, one) for one in seeds] for name, seeds in answers.items()}
     objects = study.data.object_ids[study.data.parts["test"]][study.answers[SFT][0].contact]
+    of_several = lambda scores: {m: s for m, s in scores.items() if len({*objects[s.items]}) > 1}
+    rows = {name: [of_several(score(study, one)) for one in seeds] for name, seeds in answers.items()}
     estimates = estimate_rows(rows, objects)
     arms = {name: estimates.pop(name) for name in study.policies}
     return Scored(rows=rows, objects=objects, arms=arms, baselines=estimates)

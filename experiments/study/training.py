@@ -6,7 +6,7 @@ import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from experiments.core.concurrency import SEED_BYTES
 from experiments.core.context import Context
@@ -32,7 +32,7 @@ from touchr1_jax.training.optimizer import OptimizerConfig
 from touchr1_jax.training.train_encoder import EncoderTrainingConfig
 from touchr1_jax.training.train_sft import SFTConfig
 from touchr1_jax.types import Params
-from touchr1_jax.validation import at_least, unused
+from touchr1_jax.validation import at_least, by_name, unused
 
 GRPO_SHARE = 0.35  # share of the training objects that SFT never sees under recipe `paper`
 
@@ -96,7 +96,7 @@ class TrainingConfig(SourceConfig):
     anchor: float = 1.0
     """Weight of the verified answers' likelihood in GRPO, under recipe `touch`."""
     grpo: GRPOConfig = GRPOConfig.paper()
-    more_rewards: dict[str, float] = dataclasses.field(default_factory=dict)
+    more_rewards: Annotated[dict[str, float], by_name(float)] = dataclasses.field(default_factory=dict)
     """Rewards that every arm earns besides its own, as in `overlong 0.1 diversity 0.05`."""
     grpo_steps: int = 150
     grpo_save_every: int = 50
@@ -170,7 +170,8 @@ def open_data(config: TrainingConfig, view_px: int, context: Context, at_once: i
     Frames past the strain limit stay in: leaving them out would let the length of the force ramp give hardness away.
 
     Raises:
-      DataError: records of a sensor that answers cannot name, or a part without any label of hardness or the like.
+      DataError: records of a sensor that answers cannot name, a part without any label of hardness or the like, or
+        one object alone with such a label to test on.
       ConfigurationError: other records than the run began with.
     """
     clip = ClipConfig(
@@ -197,6 +198,12 @@ def open_data(config: TrainingConfig, view_px: int, context: Context, at_once: i
             f"part {bare[0]!r} of {data.store.path} holds no object with a label of {', '.join(ORDINAL)}: every part "
             "needs one, for scores are of them; label some by `python -m sensors_io label RECORDS --labels LABELS.csv "
             "--annotator NAME`, or deal the splits out anew"
+        )
+    test = data.object_ids[data.parts["test"]][data.labels("test")[:, scored].max(1) >= 0]
+    if len({*test}) < 2:
+        raise DataError(
+            f"part 'test' of {data.store.path} holds {str(test[0])!r} alone with a label of {', '.join(ORDINAL)}: must "
+            "hold two objects, for intervals are over objects; label more, or deal the splits out anew"
         )
     return data
 

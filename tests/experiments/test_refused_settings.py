@@ -170,3 +170,9 @@ def test_an_option_out_of_range_ends_the_command(field, value, tmp_path, capsys)
     assert f"{field.rpartition('.')[2].replace('-', '_')} is {value}" in error
     assert "Traceback" not in error
     assert not list(tmp_path.iterdir())
+
+
+def test_a_reward_that_is_weighted_twice_ends_the_command(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main(["ablation_ordinal", "--more-rewards", "overlong", "1", "overlong", "2", "--runs-dir", str(tmp_path)])
+    assert "overlong is given twice" in capsys.readouterr().err

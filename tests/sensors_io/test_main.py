@@ -184,6 +184,8 @@ NO_DIRECTORY = [[*name.split(), "nowhere"] for name in (*LAYOUTS.split(), "vtv15
         (2, ["import", "tvl", "t", "--out", ""], "ValueError: --out is '': must not be empty; give its value"),
         (2, ["import", "tvl", "t", "--out="], "ValueError: --out is '': must not be empty; give its value"),
         (2, ["check", ""], "ValueError: an argument is '': must not be empty; give its value"),
+        (2, ["import", "tvl", "t", "--out=~/r"], "ValueError: --out=~/r: the shell leaves this ~ as it is; write the"),
+        (2, ["check", "~/r"], "ValueError: ~/r: the shell leaves this ~ as it is; write the whole path"),
     ],
 )
 def test_known_errors_are_one_line(run, tmp_path, monkeypatch, status, args, message):

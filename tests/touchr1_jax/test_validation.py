@@ -2,10 +2,12 @@
 
 import dataclasses
 import math
+from typing import Annotated
 
 import pytest
+import tyro
 
-from touchr1_jax.validation import above, at_least, some_of, within
+from touchr1_jax.validation import above, at_least, by_name, some_of, within
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,3 +42,16 @@ def test_a_size_is_finite():
     """An infinite weight makes every loss NaN, an infinite ε every advantage 0."""
     with pytest.raises(ValueError, match="share is inf: must be finite; lower it"):
         at_least(Bounded(math.inf), 1, "share")
+
+
+@dataclasses.dataclass(frozen=True)
+class Named:
+    shares: Annotated[dict[str, float], by_name(float)]
+
+
+@pytest.mark.parametrize(("words", "said"), [("a 1 b 2 a 3", "a is given twice"), ("a 1 b", "b has no value")])
+def test_a_mapping_of_a_command_line_names_each_once(capsys, words, said):
+    assert tyro.cli(Named, args=["--shares", "a", "1", "b", "2"]) == Named({"a": 1.0, "b": 2.0})
+    with pytest.raises(SystemExit):
+        tyro.cli(Named, args=["--shares", *words.split()])
+    assert said in capsys.readouterr().err

@@ -48,7 +48,7 @@ KERNELS: dict[str, Kernel] = {
     **dict.fromkeys(("proj", "out"), UNJOINED),
     **dict.fromkeys(("tactile_in", "merge_in", "merger_in", "force_in", "linear_fc1"), OPENING),
     **dict.fromkeys(("tactile_out", "merge_out", "merger_out", "force_out", "linear_fc2"), CLOSING),
-    **dict.fromkeys(("patch", "stem", "energy", "time", "latent", "pixels", "patches", "condition"), ENTRY),
+    **dict.fromkeys(("patch", "cell", "stem", "energy", "time", "latent", "pixels", "patches", "condition"), ENTRY),
 }
 """Dense layers by name, a number at its end left out."""
 

@@ -40,7 +40,7 @@ from touchr1_jax.text.language import TOUCH_LANGUAGE, Language
 from touchr1_jax.text.lexer import tags_of
 from touchr1_jax.text.oracle import Reading, read
 from touchr1_jax.types import Parsed, Target
-from touchr1_jax.validation import at_least, within
+from touchr1_jax.validation import at_least, by_name, within
 
 PUBLISHED: Mapping[str, float] = {"accuracy": 0.6, "consistency": 0.3, "format": 0.1}
 """Weights of Touch-R1 (arXiv 2605.27154)."""
@@ -87,13 +87,13 @@ class ExplainAnswer:
 
     text: str
     """The answer."""
-    label: dict[str, str] = dataclasses.field(default_factory=dict)
+    label: Annotated[dict[str, str], by_name(str)] = dataclasses.field(default_factory=dict)
     """Right levels, as in `hardness soft`."""
     asked: tuple[str, ...] = ()
     """Attributes asked for; by default the labelled ones, else those that the answer concludes about."""
     sensors: tuple[str, ...] = ()
     """Sensors that are present; by default those that the answer reports on."""
-    weights: dict[str, float] = dataclasses.field(default_factory=dict)
+    weights: Annotated[dict[str, float], by_name(float)] = dataclasses.field(default_factory=dict)
     """Weight of each reward, as in `accuracy 0.6 format 0.1`; by default the published ones."""
     length: int | None = None
     """Tokens before the end token; by default the words of the text."""
@@ -286,7 +286,7 @@ def _console(stderr: bool = False) -> Console:
 class SearchAnswers:
     """Search all short answers for those that earn more without touch than an honest answer with touch."""
 
-    weights: dict[str, float] = dataclasses.field(default_factory=dict)
+    weights: Annotated[dict[str, float], by_name(float)] = dataclasses.field(default_factory=dict)
     """Weight of each reward; by default the published ones, and then the stable ones."""
     prior: tuple[float, float, float] = (1 / 3, 1 / 3, 1 / 3)
     """Share of each level among the labels."""

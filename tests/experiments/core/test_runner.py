@@ -85,6 +85,7 @@ def test_a_run_leaves_the_agreed_files(capsys):
     assert {p.name for p in (directory / "plots").iterdir()} == {"curves_train.svg", "accuracy_against_middle.svg"}
     assert "report.html" in capsys.readouterr().out
     (directory / "results.json").write_text("{}")  # of which the next run needs nothing
+    (directory / "timing.json").write_text("{")  # of which it needs the usual time alone
     assert run("coin", "--scale=smoke", "--toss.bias", "0.25", "--coin", "silver") == 0
 
 

@@ -209,3 +209,15 @@ def test_a_part_without_labels_is_refused_before_training(tmp_path, records, con
         DataError, match=f"part '{part}' of .*copy holds no object with a label of hardness, .*: every part"
     ):
         open_data(config, 16, context)
+
+
+def test_one_object_alone_is_no_test_part(tmp_path, records, context):
+    """Before, a run trained to its end and then had no interval over objects."""
+    shutil.copytree(records, tmp_path / "copy")
+    cards = list(RecordStore(records).objects.values())
+    first = next(card.object_id for card in cards if card.split == "test")
+    other = lambda card: card.split == "test" and card.object_id != first
+    replace_cards(tmp_path / "copy", [dataclasses.replace(card, labels={}) if other(card) else card for card in cards])
+    config = dataclasses.replace(tiny.STUDY, data="records", data_dir=tmp_path / "copy")
+    with pytest.raises(DataError, match=f"part 'test' of .*copy holds '{first}' alone with a label of hardness"):
+        open_data(config, 16, context)

@@ -27,7 +27,7 @@ from experiments.study.seed import SeedTraining
 from experiments.study.stages import ProbeFeatures
 from experiments.study.study import CONTINUED, SFT, Study, StudyConfig, check_arms, run_study
 from sensors_io.arrays import ArraysError
-from sensors_io.schema import SENSORS
+from sensors_io.schema import ATTRIBUTES, SENSORS
 from tests.experiments import tiny
 from tests.sensors_io.checks import refused
 from touchr1_jax.models.layers import SizeError
@@ -220,6 +220,19 @@ def test_every_policy_and_baseline_is_scored_on_the_same_questions(study):
     assert len(scored.objects) == 19
     for name, said in baselines(study).items():
         assert scored.baselines[name]["acc"].mean == pytest.approx(table(study, said)["acc"])
+
+
+@pytest.mark.long
+def test_a_metric_about_one_object_alone_is_left_out(study):
+    """Before, a run of records with hardness on one test object trained to its end and then had no interval."""
+    one = score_study(study).objects == score_study(study).objects[0]
+    kept = one[:, None] | (np.arange(4) != ATTRIBUTES.index("hardness"))
+    relabelled = lambda said: dataclasses.replace(said, label=np.where(kept, said.label, -1))
+    answers = {name: [relabelled(said) for said in seeds] for name, seeds in study.answers.items()}
+    scored = score_study(dataclasses.replace(study, answers=answers))
+    for row in scored.estimates.values():
+        assert "h_acc" not in row
+        assert {"acc", "r_acc"} <= set(row)
 
 
 def test_levels_are_given_contact_by_contact_and_by_single_sensors(study):

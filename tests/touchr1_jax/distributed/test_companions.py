@@ -58,6 +58,14 @@ def test_two_configurations_are_named_before_anything_is_compiled(tmp_path):
 
 
 @pytest.mark.slow
+def test_fresh_in_one_process_alone_is_named(tmp_path):
+    """Before, that of process 0 decided, without a word."""
+    for process in start(tmp_path, [], ["--fresh"]):
+        assert "fresh is " in errors(process)
+        assert process.returncode == 1
+
+
+@pytest.mark.slow
 def test_processes_without_a_common_folder_are_named(tmp_path):
     for folder in (folders := (tmp_path / "a", tmp_path / "b")):
         folder.mkdir()

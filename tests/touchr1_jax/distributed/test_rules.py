@@ -1,6 +1,7 @@
 """The rules name every parameter that there is, split what is large, and refuse the rest by name."""
 
 import math
+from typing import get_args, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from touchr1_jax.models.layers import SizeError
 from touchr1_jax.models.lora import LoraConfig, init_adapters
 from touchr1_jax.models.qwen.config import released
 from touchr1_jax.models.qwen.model import abstract_params
+from touchr1_jax.models.vision import VisionConfig
 
 MESH = MeshConfig(data=2, fsdp=4, tensor=2).abstract()
 
@@ -89,6 +91,14 @@ def test_the_frame_decoder_is_named():
     config = FrameDecoderConfig(width=8, num_layers=1)
     init = lambda: FrameDecoder(config).init(jax.random.key(0), frames, frames, patches, jnp.zeros((1, 2)))
     assert specs(jax.eval_shape(init)["params"])["conv_0/kernel"] == P(None, None, None, "fsdp")
+
+
+@pytest.mark.parametrize("stem", get_args(get_type_hints(VisionConfig)["stem"]))
+def test_the_vision_tower_is_named_with_every_stem(stem):
+    """That of studies reads statistics: before, each of them ended in an error on a mesh."""
+    tower, view = VisionConfig(stem=stem).tower(8), jnp.zeros((1, 64, 64, 3), jnp.uint8)
+    found = specs(jax.eval_shape(lambda: tower.init(jax.random.key(0), view))["params"])
+    assert found[f"{'cell' if stem == 'statistics' else 'patch'}/kernel"] == P(None, "fsdp")
 
 
 def test_a_parameter_without_a_rule_is_named():

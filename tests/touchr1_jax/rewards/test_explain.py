@@ -118,6 +118,13 @@ def test_values_out_of_range_are_refused(capsys, arguments, message):
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("twice", ["--label hardness soft hardness firm", "--weights exact 1 format 1 exact 2"])
+def test_a_name_that_is_given_twice_is_refused(capsys, twice):
+    with pytest.raises(SystemExit):
+        main(["explain", "--text", ANSWER, *twice.split()])
+    assert f"{twice.split()[1]} is given twice" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt, 130), (OSError("full"), 1)])
 def test_ctrl_c_and_a_full_disk_leave_no_traceback(monkeypatch, error, status):
     monkeypatch.setattr(ListRewards, "run", Mock(side_effect=error))
