@@ -6,6 +6,7 @@ import re
 import sys
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # see `experiments.core.numerics`; read when NumPy is imported
+os.environ["MPLBACKEND"] = "svg"  # charts are files; by the name of a window that is gone matplotlib is not imported
 
 from sensors_io.errors import require_kept, require_words
 from sensors_io.signals import end_as_interrupted, leave_interrupted, say

@@ -1,7 +1,8 @@
 """Settings that the bits of a result depend on besides configuration and code: JAX, XLA, NumPy, OpenCV, device, CPU.
 
-Cores, threads and thread pools change no bit: `experiments.__main__` gives NumPy's linear algebra one thread, for more
-would add in another order.  The number of devices does change bits; the cache of policies counts the mesh.
+XLA for CPUs adds up large arrays in as many parts as this process has cores, so that the number of cores counts too.
+Other threads change no bit: `experiments.__main__` gives NumPy's linear algebra one, for more would add in another
+order.  The number of devices does change bits; the cache of policies counts the mesh.
 """
 
 import os
@@ -60,6 +61,8 @@ count where they differ."""
 DECODERS = "OPENCV_VIDEOIO_PRIORITY_"
 """Variables that begin so count too: each gives a decoder of OpenCV's its rank, or lists them."""
 
+_CHOSEN = hasattr(os, "sched_getaffinity")  # on Linux
+
 HARMLESS = ("--xla_force_host_platform_device_count", "--xla_dump", "--xla_hlo_profile")
 """Flags of XLA that change no result."""
 
@@ -102,8 +105,14 @@ def require_same(before: Mapping[str, Any] | None, where: object) -> None:
 
 
 def machine() -> dict[str, str]:
-    """The kinds of device and of processor."""
-    return {"device": jax.default_backend(), "processor": processor()}
+    """The kinds of device and of processor; where the processor is the device, its cores as XLA counts them."""
+    device = jax.default_backend()
+    return {"device": device, "processor": processor()} | ({"cores": cores()} if device == "cpu" else {})
+
+
+def cores() -> str:
+    """Number of cores that this process may use, unless the variable NPROC states another to XLA."""
+    return os.environ.get("NPROC") or str(len(os.sched_getaffinity(0) if _CHOSEN else range(os.cpu_count() or 1)))
 
 
 def changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> tuple[str, ...]:

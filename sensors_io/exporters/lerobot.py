@@ -13,6 +13,7 @@ shapes, or in the number of frames of their sensors, are refused by name.
 """
 
 import collections
+import contextlib
 import pathlib
 from typing import Any
 
@@ -54,7 +55,7 @@ def export_lerobot(selected: Selected, out: pathlib.Path, fps: int, progress: Pr
     Raises:
       ExportError: `out` exists, pyarrow or PyAV is not installed, or the contacts do not share one shape.
     """
-    with published(out) as temporary:
+    with published(out) as temporary, contextlib.ExitStack() as stack:
         files, tasks = None, dict[str, int]()
         rows: list[dict[str, Any]] = []
         for episode, (_, contact) in enumerate(selected.contacts(progress)):
@@ -62,6 +63,7 @@ def export_lerobot(selected: Selected, out: pathlib.Path, fps: int, progress: Pr
             if files is None:
                 fps = fps or _rate(next(iter(contact.values())))
                 files = EpisodeFiles(temporary, {name: feature(x) for name, x in columns.items()}, fps)
+                stack.callback(files.abandon)
             _check(columns, files.features, next(iter(contact.values())))
             task = _task(contact, selected)
             files.add(columns, task, tasks.setdefault(task, len(tasks)))

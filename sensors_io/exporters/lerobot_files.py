@@ -116,6 +116,11 @@ class EpisodeFiles:
         stats = {name: moments.figures() for name, moments in self._stats.items()}
         (self._root / _STATS).write_text(json.dumps(stats), encoding="utf-8")
 
+    def abandon(self) -> None:
+        """Write no more: a table that the disk did not take would be closed, and fail, once more when it is freed."""
+        if self._table is not None:
+            self._table.is_open = False
+
     def _described(self, name: str) -> dict[str, Any]:
         entry = self.features[name]
         if entry["dtype"] != "video":

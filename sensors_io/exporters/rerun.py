@@ -11,6 +11,10 @@ from sensors_io.schema import Flag, Phase, Sequence
 _ARROWS = 16
 """Arrows of a vector field along its longer side."""
 
+_STILL_S = 5.0  # without a byte written, after which a disk takes no more
+_STUCK: list[Any] = []
+"""Recordings that a disk did not take: to close one, or to end with one, may wait for ever, deaf to Ctrl-C."""
+
 
 def export_rerun(selected: Selected, out: pathlib.Path, progress: Progress) -> None:
     """Write contacts as one recording, whole or not at all.
@@ -40,10 +44,30 @@ def export_rerun(selected: Selected, out: pathlib.Path, progress: Progress) -> N
             for sensor, sequence in contact.items():
                 _log_sequence(rr, log, f"{name}/{rr.escape_entity_path_part(sensor)}", sequence, start)
         try:
-            log.flush()
+            _flush(log, temporary)
         except RuntimeError as error:  # the library says on standard error which
+            _STUCK.append(log.to_native())
+            rr.unregister_shutdown()
             raise ExportError(f"--out is {out}: cannot be written ({error}); free some space in its folder") from error
         log.disconnect()
+
+
+def _flush(log: Any, file: pathlib.Path) -> None:
+    """Wait for what was logged as long as the file grows.
+
+    Raises:
+      RuntimeError: it could not be written.
+    """
+    size = -1
+    while True:
+        try:
+            log.flush(timeout_sec=_STILL_S)
+        except RuntimeError:
+            if (now := file.stat().st_size) == size:
+                raise
+            size = now
+        else:
+            return
 
 
 def _log_sequence(rr: Any, log: Any, name: str, sequence: Sequence, start_ns: int) -> None:

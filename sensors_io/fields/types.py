@@ -9,7 +9,6 @@ import io
 import json
 import os
 import pathlib
-import tempfile
 from collections.abc import Mapping
 from typing import Any, Self
 
@@ -175,13 +174,13 @@ class Calibration:
 def write_whole(path: pathlib.Path, data: bytes) -> None:
     """Write a file by way of a temporary one in the same folder, so that no reader ever sees half of it."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with os.fdopen(handle, "wb") as file:
+        with temporary.open("wb") as file:  # as readable as all that the user writes
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(name, path)
+        temporary.replace(path)
     except BaseException:
-        pathlib.Path(name).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise

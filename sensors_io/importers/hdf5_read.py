@@ -33,6 +33,9 @@ SPELLED = {
 LEAST_PULL_N = 0.5
 """Force away from the gel that neither drift nor adhesion explains."""
 
+MOST_ROWS = 10**7
+"""Rows of one contact: 24 minutes of a force at 7 kHz.  A file of some kilobytes may state more than memory holds."""
+
 LATE = 1.5
 """Median periods between two frames from which on one is taken to be missing."""
 
@@ -124,7 +127,9 @@ def bounds(file: Any, group: str, rows: RowsMap) -> np.ndarray:
     Raises:
       HDF5Error: they are no ascending whole numbers.
     """
-    found = np.asarray(dataset(file, group, rows.path, rows.kind)[()])
+    stated_rows = dataset(file, group, rows.path, rows.kind)
+    _require_few(stated_rows.size, rows.path, rows.kind)
+    found = np.asarray(stated_rows[()])
     whole = np.issubdtype(found.dtype, np.integer) and found.ndim == 1
     ends = found.astype(np.int64) if whole else np.zeros(1, np.int64)
     ends = np.append(0, np.cumsum(ends)) if whole and rows.kind == "lengths" else ends
@@ -134,6 +139,11 @@ def bounds(file: Any, group: str, rows: RowsMap) -> np.ndarray:
         )
         raise HDF5Error(f"{rows.path} must hold the {must}, whole numbers ≥ 0, the rows ascending")
     return ends
+
+
+def _require_few(rows: int, path: str, what: str) -> None:
+    if rows > MOST_ROWS:
+        raise HDF5Error(f"{path} for {what} has {rows} rows: must have ≤ {MOST_ROWS}; cut the recording into contacts")
 
 
 def dataset(file: Any, group: str, path: str, what: str) -> Any:
@@ -267,6 +277,7 @@ class _Rows:
             self.first, self.end = bounds(file, place.group, array.rows)[place.row : place.row + 2].tolist()
         if self.end > self.data.shape[self.axis]:
             raise HDF5Error(f"{array.path} for {what} has {self.data.shape[self.axis]} rows: {self.end} are stated")
+        _require_few(len(self), array.path, what)
         self.notes: list[str] = []
         self._require_unit()
 

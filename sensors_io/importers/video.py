@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import pathlib
+import struct
 from collections.abc import Iterator
 from typing import Any
 
@@ -18,6 +19,7 @@ _MOST_STATED = 10**6  # frames that a header is believed
 _TIMED = (".mkv", ".webm")
 """Files that state no number of frames: OpenCV takes the duration of their longest stream times a rate."""
 _SOUND_S = 0.25  # by which sound may outlast the pictures
+_INDEX = np.dtype([("stream", "S2"), ("kind", "S2"), ("flags", "<u4"), ("start", "<u4"), ("bytes", "<u4")])  # of AVI
 _EBML, _SEGMENT = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67"  # the two elements of a Matroska file (RFC 9559)
 
 
@@ -95,8 +97,21 @@ def is_cut_off(path: pathlib.Path, stated: int, count: int, rate_hz: float, last
     if path.suffix.lower() in mp4.SUFFIXES:
         return mp4.is_cut_off(path, stated, count)
     if path.suffix.lower() not in _TIMED:
-        return count < stated
+        return count < stated - _dropped(path)
     return _lacks_bytes(path) or (count < stated and stated - 1 - last > _SOUND_S * rate_hz)
+
+
+def _dropped(path: pathlib.Path) -> int:
+    """Entries of no bytes in the index of an AVI file, each for a frame that was dropped, or came before the sound."""
+    start, found = 12, 0  # behind "RIFF", a size and the kind
+    with path.open("rb") as file:
+        while file.seek(start) and len(head := file.read(8)) == 8:
+            kind, size = struct.unpack("<4sI", head)
+            if kind == b"idx1":
+                rows = np.frombuffer(file.read(size // _INDEX.itemsize * _INDEX.itemsize), _INDEX)
+                found += int(((rows["bytes"] == 0) & np.isin(rows["kind"], (b"dc", b"db"))).sum())
+            start += 8 + size + size % 2
+    return found
 
 
 def _lacks_bytes(path: pathlib.Path) -> bool:

@@ -8,12 +8,13 @@ connections that browsers open to one server.
 
 import contextlib
 import dataclasses
-import http.cookies
+import errno
 import http.server
 import ipaddress
 import json
 import math
 import secrets
+import socket
 import sys
 import threading
 import urllib.parse
@@ -109,13 +110,23 @@ class LiveView:
     @property
     def address(self) -> str:
         """Address for browsers, with the token if one is needed."""
-        host, port = self._wanted[0], (self._wanted if self._server is None else self._server.server_address)[1]
-        return f"http://{host}:{port}/" + (f"?token={self._token}" if self._token else "")
+        host = self._wanted[0]
+        shown = f"[{host}]" if ":" in host else host
+        return f"http://{shown}:{self._port}/" + (f"?token={self._token}" if self._token else "")
+
+    @property
+    def _port(self) -> int:
+        return int((self._wanted if self._server is None else self._server.server_address)[1])
 
     @property
     def cookie(self) -> str:
-        """By which a browser that was admitted shows the token again; empty where none is needed."""
-        return f"token={self._token}; HttpOnly; SameSite=Strict" if self._token else ""
+        """Name of the cookie by which a browser shows the token again: it has one jar for all ports of a machine."""
+        return f"token-{self._port}"
+
+    @property
+    def set_cookie(self) -> str:
+        """The cookie, for a browser that was admitted; empty where none is needed."""
+        return f"{self.cookie}={self._token}; HttpOnly; SameSite=Strict" if self._token else ""
 
     def admits(self, host: str, token: str) -> bool:
         """True if a request may be answered: it names this machine, so that no other page can ask, or has the token."""
@@ -176,10 +187,14 @@ class LimitedServer(http.server.ThreadingHTTPServer):
     request_queue_size = _CONNECTIONS
 
     def __init__(self, address: tuple[str, int], handler: type[http.server.BaseHTTPRequestHandler]):
+        if ":" in address[0]:
+            self.address_family = socket.AF_INET6
         try:
             super().__init__(address, handler)
         except OSError as error:
             reason = f"{error.strerror}: {address[0]}:{address[1]}; name another --port, or 0 for a free one"
+            if error.errno not in (errno.EADDRINUSE, errno.EACCES):
+                reason = f"{error.strerror}: {address[0]}; must be an address of this machine, such as 127.0.0.1 or ::1"
             raise OSError(error.errno, reason) from error
         self._free = threading.Semaphore(_CONNECTIONS)
 
@@ -220,7 +235,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         if not self.live.admits(self.headers.get("Host", ""), token):
             self.send_error(403, "open the address that the program printed")
         elif path == "/":
-            self._whole("text/html; charset=utf-8", PAGE.encode(), self.live.cookie)
+            self._whole("text/html; charset=utf-8", PAGE.encode(), self.live.set_cookie)
         elif path == "/numbers":
             self._numbers()
         elif path.startswith("/panel/"):
@@ -232,12 +247,9 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         """Say nothing: the terminal belongs to the session."""
 
     def _cookie(self) -> str:
-        """The token that the page was opened with."""
-        try:
-            found = http.cookies.SimpleCookie(self.headers.get("Cookie", "")).get("token")
-        except http.cookies.CookieError:
-            return ""
-        return "" if found is None else found.value
+        """The token that the page was opened with, among cookies of whatever else this machine serves."""
+        pairs = (pair.strip().partition("=") for pair in self.headers.get("Cookie", "").split(";"))
+        return next((value for name, _, value in pairs if name == self.live.cookie), "")
 
     def _whole(self, kind: str, data: bytes, cookie: str = "") -> None:
         self.send_response(200)

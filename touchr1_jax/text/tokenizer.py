@@ -15,6 +15,10 @@ PAD, END, TACTILE, VIEW = "<pad>", "<end>", "<tactile>", "<view>"
 """Special tokens of the tokenizers made here; each adds nothing to the text."""
 
 
+MOST_IDS = 1 << 24
+"""A hundred times the largest vocabulary; an id of 2³² in a damaged file would ask for 34 GB."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Tokenizer:
     """A vocabulary: decode(ids) = utf8(pieces[ids[0]] + pieces[ids[1]] + …), undecodable bytes replaced.
@@ -132,8 +136,9 @@ def from_tokenizers(
         raise ValueError(f"the tokenizer decodes with {library.decoder}: must be ByteLevel; use a byte-level BPE")
     tokens = library.get_vocab(with_added_tokens=True)
     size = max(tokens.values()) + 1 if vocab_size is None else vocab_size
-    if size <= max(tokens.values()):
-        raise ValueError(f"vocab_size is {size}: must exceed the largest id, {max(tokens.values())}; use the model's")
+    if not max(tokens.values()) < size <= MOST_IDS:
+        need = f"must exceed the largest id, {max(tokens.values())}, and be ≤ {MOST_IDS}"
+        raise ValueError(f"vocab_size is {size}: {need}; use the model's")
     alphabet = _byte_alphabet()
     special = {i for i, token in library.get_added_tokens_decoder().items() if token.special}
     pieces = [b""] * size
@@ -166,7 +171,9 @@ def from_file(path: str | Path, *, vocab_size: int | None = None) -> Tokenizer:
         raise FileNotFoundError(f"{path} is no file: must be the tokenizer.json of a checkpoint; correct the path")
     try:
         library = tokenizers.Tokenizer.from_file(str(path))
-    except Exception as error:  # the library raises nothing more particular
+    except (KeyboardInterrupt, SystemExit):
+        raise
+    except BaseException as error:  # the library raises nothing more particular; its panics are no `Exception`
         raise ValueError(f"{path} is no tokenizer ({error}): must be that of a checkpoint; fetch it again") from error
     return from_tokenizers(library, vocab_size=vocab_size)
 

@@ -119,3 +119,26 @@ def test_a_variable_that_jax_cannot_read_is_named():
     assert done.returncode == 2
     assert "'maybe' for environment 'JAX_ENABLE_X64': a variable" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_charts_need_no_window_whatever_the_environment_names():
+    """matplotlib refuses to be imported by the name of a window that is gone: a run would end at its first chart."""
+    order = [sys.executable, "-c", "import experiments.__main__, matplotlib as mpl; assert mpl.get_backend() == 'svg'"]
+    subprocess.run(order, env=os.environ | {"MPLBACKEND": "Qt4Agg"}, check=True)
+
+
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="one core gives one number of parts")
+def test_cores_change_the_bits_of_large_sums_and_are_counted():
+    source = (
+        "import experiments.__main__, os, sys;"
+        "os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: int(sys.argv[1])]);"
+        "import jax, jax.numpy as jnp, numpy as np; from experiments.core import numerics;"
+        "x = jnp.asarray(np.random.default_rng(0).normal(size=100_000), jnp.float32);"
+        "print(float(jax.jit(jnp.sum)(x)).hex(), numerics.machine()['cores'])"
+    )
+    run = lambda cores: subprocess.run(
+        [sys.executable, "-c", source, cores], check=True, capture_output=True, text=True
+    )
+    (one, counted), (two, of_two) = (run(cores).stdout.split() for cores in "12")
+    assert (counted, of_two) == ("1", "2")
+    assert one != two  # where this fails, XLA has changed: cores need not count any longer

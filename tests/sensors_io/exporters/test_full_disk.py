@@ -1,7 +1,9 @@
 """Exports and records on a disk that fills: one error with a name, no crash, nothing half-written, nothing lost."""
 
 import errno
+import gc
 import io
+import sys
 
 import pytest
 
@@ -93,9 +95,14 @@ def test_a_shard_that_finds_no_room_is_named(tmp_path, monkeypatch, capsys):
 
 
 def test_rerun_on_a_full_disk_is_named(tmp_path, monkeypatch, capsys):
+    """Without a limit the library may wait for ever, deaf to Ctrl-C; as long as the file grows, it is waited for."""
     rr = pytest.importorskip("rerun")
+    waited = []
 
-    def full(self):
+    def full(self, *, timeout_sec):
+        waited.append(timeout_sec)
+        if len(waited) < 3:
+            next(tmp_path.glob("*.tmp")).write_bytes(bytes(10_000 * len(waited)))
         raise RuntimeError("File-writer thread shut down prematurely")
 
     monkeypatch.setattr(rr.RecordingStream, "flush", full)
@@ -103,6 +110,28 @@ def test_rerun_on_a_full_disk_is_named(tmp_path, monkeypatch, capsys):
     assert main(["export", str(records), "--to", "rerun", "--out", str(tmp_path / "x.rrd")]) == 1
     assert "cannot be written (File-writer thread shut down prematurely); free some space" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["r"]
+    assert len(waited) == 3
+    assert max(waited) < 60
+
+
+def test_lerobot_on_a_full_disk_ends_in_one_line(tmp_path, monkeypatch, capsys):
+    """The writer of tables would be closed, and fail, once more when it is freed: a traceback that nobody catches."""
+    tables, _ = pytest.importorskip("pyarrow.parquet"), pytest.importorskip("av")
+    ignored, close = [], tables.ParquetWriter.close
+
+    def full(self):
+        if self.is_open:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        close(self)
+
+    records = fakes.write(tmp_path / "r", 1)
+    with monkeypatch.context() as disk:
+        disk.setattr(tables.ParquetWriter, "close", full)
+        disk.setattr(sys, "unraisablehook", lambda hook: ignored.append(repr(hook.exc_value)))
+        assert main(["export", str(records), "--to", "lerobot", "--out", str(tmp_path / "x")]) == 1
+        gc.collect()
+    assert "No space left on device" in capsys.readouterr().err
+    assert ignored == []
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EMFILE, errno.ELOOP])

@@ -137,6 +137,8 @@ def test_a_gel_unlike_that_of_the_calibration_is_named(change) -> None:
 def test_a_calibration_is_read_back_and_a_changed_one_is_refused(tmp_path: pathlib.Path) -> None:
     made, path = calibration(dotted()), tmp_path / "c.npz"
     made.save(path)
+    (plain := path.with_name("plain")).touch()
+    assert path.stat().st_mode == plain.stat().st_mode  # others of a laboratory read what they may read
     assert Calibration.load(path).hash == made.hash
     arrays = dict(np.load(path))
     signed = [{"plain": np.array(str(arrays["plain"]).replace(made.hash, by * 16))} for by in "0f"]

@@ -123,3 +123,15 @@ def test_listing_and_proposal_bear_odd_files(tmp_path, capsys):
     assert "self/  (a link to /trials/0)" in said
     assert "@red = a b [31m" in said
     assert '"contact": "/trials/*"' in said
+
+
+def test_rows_that_a_file_of_kilobytes_states_and_no_memory_holds_are_refused(tmp_path):
+    """Chunks that nobody wrote take no place in a file."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        trial(group := file.create_group("trials/0"))
+        del group["mini/rgb"], group["mini/time"]
+        group.create_dataset("mini/rgb", shape=(2 * 10**7, 4, 4, 3), dtype="u1", chunks=(1, 4, 4, 3))
+        group.create_dataset("mini/time", shape=(2 * 10**7,), dtype="f8", chunks=(1024,))
+    assert (tmp_path / "a.h5").stat().st_size < 50_000
+    with pytest.raises(ImportSourceError, match="has 20000000 rows: must have ≤ 10000000; cut the recording"):
+        imported(tmp_path, mapped(mini={"depth_mm": None}))

@@ -4,6 +4,8 @@ import errno
 import os
 import pathlib
 import struct
+import subprocess
+import sys
 import zlib
 
 import cv2
@@ -54,6 +56,19 @@ def test_a_stack_of_pictures_is_not_its_first_one(tmp_path):
     refused(PictureError, "holds 3 pictures: must hold one", read_picture, tmp_path / "a.tif")
     cv2.imwritemulti(str(tmp_path / "a.tif"), [pages[1], pages[2][::4, ::4]])  # a preview
     assert read_picture(tmp_path / "a.tif").max() == 20
+
+
+def test_a_picture_of_more_pixels_than_any_camera_has_is_refused(tmp_path):
+    """A gigapixel of one colour is a file of 130 kB and takes 8 GB; commands import this package before OpenCV."""
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((12_000, 12_000), np.uint8))
+    source = (
+        "import pathlib, sys; from sensors_io.importers.pictures import read_picture as r; r(pathlib.Path(sys.argv[1]))"
+    )
+    order = [sys.executable, "-c", source, str(tmp_path / "a.png")]
+    env = {name: value for name, value in os.environ.items() if name != "OPENCV_IO_MAX_IMAGE_PIXELS"}
+    env["PYTHONPATH"] = os.pathsep.join(sys.path)
+    done = subprocess.run(order, env=env, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert "PictureError: is larger than any picture" in done.stderr
 
 
 def test_lost_pictures_are_named_and_mark_the_frame_behind_them(tmp_path):

@@ -83,6 +83,20 @@ def test_sound_may_last_a_little_longer_and_pictures_begin_late(tmp_path, first_
     refused(VideoError, "is cut off, or its sound is longer", read_video, path, Keep(**WHOLE))
 
 
+@pytest.mark.parametrize("lost", [0, 1])
+def test_an_avi_file_states_frames_that_were_dropped_too(tmp_path, lost):
+    """Before compressed sound comes an entry without a picture, as in the place of each dropped frame."""
+    path = uneven_film(tmp_path / "a.avi", range(0, 1200, 40), sound_s=1.2)
+    assert cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_FRAME_COUNT) > 30
+    if lost:
+        data = path.read_bytes()
+        last = data.rindex(b"00dc", 0, data.index(b"idx1"))
+        path.write_bytes(data[: last + 8] + bytes(len(data[last + 8 :])))
+        refused(VideoError, "is cut off", read_video, path, Keep(**WHOLE))
+    else:
+        assert read_video(path, Keep(**WHOLE)).total == 30
+
+
 def test_an_mp4_in_fragments_is_whole_whatever_its_sound_and_refused_where_it_is_cut(tmp_path):
     path = uneven_film(tmp_path / "a.mp4", range(0, 2000, 40), 4.0, movflags="frag_keyframe+empty_moov")
     assert read_video(path, Keep(**WHOLE)).total == 50

@@ -129,9 +129,23 @@ def test_a_view_for_the_network_wants_its_token():
         assert len(token) >= 16
         assert [requested(view, path)[0] for path in ("/", "/numbers", "/panel/a", "/?token=wrong")] == [403] * 4
         status, cookie = requested(view, f"/?token={token}")
-        assert (status, cookie.partition(";")[0]) == (200, f"token={token}")
+        assert (status, cookie.partition("=")[2].partition(";")[0]) == (200, token)
         view.publish({"a": plain(1, 2, 3)}, NUMBERS)
-        assert requested(view, "/panel/a", Cookie=f"token={token}")[0] == 200
+        shown = cookie.partition(";")[0]
+        assert requested(view, "/panel/a", Cookie=shown)[0] == 200
+        others = 'settings={"a": [1]}; token=x; __Host-a[b]=\xe9'  # of whatever else this machine serves
+        assert requested(view, "/panel/a", Cookie=f"{others}; {shown}")[0] == 200
+        with LiveView(port=0, host="0.0.0.0") as second:  # browsers keep one cookie of a name for all ports
+            other = requested(second, "/?token=" + second.address.partition("?token=")[2])[1]
+            assert other.partition("=")[0] != shown.partition("=")[0]
+
+
+def test_a_view_has_an_address_of_version_6(capfd):
+    with LiveView(port=0, host="::1") as view:
+        assert view.address.startswith("http://[::1]:")
+        with ask(view, "") as page:
+            assert b"EventSource" in page.read()
+    refused(OSError, "192.0.2.1; must be an address of this machine", LiveView(port=0, host="192.0.2.1").__enter__)
 
 
 def test_requests_of_no_browser_are_refused_without_a_word_in_the_terminal(capfd):

@@ -1,3 +1,4 @@
+import json
 import random
 
 import hypothesis
@@ -81,6 +82,20 @@ def test_errors_of_files_and_libraries(tmp_path):
         from_tokenizers(LIBRARY, ends=("<eos>",))
     with pytest.raises(ValueError, match=rf"vocab_size is 7: must exceed the largest id, {BPE.vocab_size - 1}"):
         from_tokenizers(LIBRARY, vocab_size=7)
+
+
+@pytest.mark.parametrize(
+    ("part", "damage", "message"),
+    [
+        ("normalizer", {"type": "Precompiled", "precompiled_charsmap": "AAAA"}, "is no tokenizer .*charsmap"),
+        ("model", {"type": "BPE", "vocab": {"a": 2**32 - 1}, "merges": []}, "and be ≤ 16777216"),
+    ],
+)
+def test_a_damaged_file_neither_panics_nor_asks_for_all_memory(tmp_path, part, damage, message):
+    tree = json.loads(LIBRARY.to_str())
+    (tmp_path / "tokenizer.json").write_text(json.dumps({**tree, part: damage}))
+    with pytest.raises(ValueError, match=message):
+        from_file(tmp_path / "tokenizer.json")
 
 
 @pytest.mark.parametrize("text", ["how squishy", "<pad>", "soft,"])
