@@ -97,7 +97,7 @@ def is_cut_off(path: pathlib.Path, stated: int, count: int, rate_hz: float, last
     if path.suffix.lower() in mp4.SUFFIXES:
         return mp4.is_cut_off(path, stated, count)
     if path.suffix.lower() not in _TIMED:
-        return count < stated - _dropped(path)
+        return count < stated and count < stated - _dropped(path)
     return _lacks_bytes(path) or (count < stated and stated - 1 - last > _SOUND_S * rate_hz)
 
 
