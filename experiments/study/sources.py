@@ -57,7 +57,7 @@ class SourceConfig:
 def prepare_records(config: SourceConfig, context: Context) -> Path:
     """Directory of the records, made or imported first where the cache lacks them; an interrupted one resumes."""
     if config.data_dir is None:
-        path = context.cache_dir / f"scenes-{config_hash(config.scenes)}"
+        path = scenes_folder(context.cache_dir, config.scenes)
         make = functools.partial(generate_records, config.scenes, path)
         _make(context, "making scenes", lambda report: make(progress=report))
         return path
@@ -66,11 +66,19 @@ def prepare_records(config: SourceConfig, context: Context) -> Path:
     source, settings = config.data_dir.resolve(), config.physiclear
     decoding = {name: x for name, x in numerics.environment().items() if name.startswith("OPENCV_")}
     about = [str(source), dataclasses.asdict(settings), *filter(None, [decoding])]
-    identity = json.dumps(about, sort_keys=True)
-    path = context.cache_dir / f"physiclear-{hashlib.sha256(identity.encode()).hexdigest()[:16]}"
+    path = context.cache_dir / f"physiclear-{_digest(about)}"
     importing = lambda report: import_catalogue(list_physiclear(source, settings), path, progress=report)
     _make(context, "importing videos", importing)
     return path
+
+
+def scenes_folder(cache_dir: Path, scenes: SceneConfig) -> Path:
+    """Directory of generated records, which depend on the settings of JAX and XLA in their last bits."""
+    return cache_dir / f"scenes-{_digest([config_hash(scenes), numerics.settings()])}"
+
+
+def _digest(about: object) -> str:
+    return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def open_source(

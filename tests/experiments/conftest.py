@@ -7,9 +7,9 @@ from rich.console import Console
 
 from experiments.core.context import Context
 from experiments.study.dataset import open_dataset
+from experiments.study.sources import scenes_folder
 from sensors_io.generate import generate_records
 from sensors_io.pipeline import ClipConfig
-from sensors_io.scenes.config import config_hash
 from tests.experiments import tiny
 from touchr1_jax.models.touch_policy import build_policy
 
@@ -18,13 +18,13 @@ from touchr1_jax.models.touch_policy import build_policy
 def cache_dir(tmp_path_factory):
     """A data cache that holds the tiny scenes already."""
     path = tmp_path_factory.mktemp("data")
-    generate_records(tiny.SCENES, path / f"scenes-{config_hash(tiny.SCENES)}")
+    generate_records(tiny.SCENES, scenes_folder(path, tiny.SCENES))
     return path
 
 
 @pytest.fixture(scope="session")
 def records(cache_dir):
-    return cache_dir / f"scenes-{config_hash(tiny.SCENES)}"
+    return scenes_folder(cache_dir, tiny.SCENES)
 
 
 @pytest.fixture(scope="session")

@@ -127,6 +127,7 @@ def test_charts_need_no_window_whatever_the_environment_names():
     subprocess.run(order, env=os.environ | {"MPLBACKEND": "Qt4Agg"}, check=True)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(numerics.cores() == "1", reason="one core gives one number of parts")
 def test_cores_change_the_bits_of_large_sums_and_are_counted():
     source = (

@@ -10,18 +10,19 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from experiments.core import numerics
 from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError, DataError
 from experiments.encoder.pretrain import StageOneDataConfig, open_touch
 from experiments.study import sources
-from experiments.study.sources import SourceConfig, prepare_records, survey_contacts
+from experiments.study.sources import SourceConfig, prepare_records, scenes_folder, survey_contacts
 from experiments.study.training import open_data, require_encoder
 from sensors_io.cards import replace_cards
 from sensors_io.commands.label import Label
 from sensors_io.importers.physiclear import PhysiclearConfig
 from sensors_io.locks import RecordsBusyError
 from sensors_io.records import RecordStore, RecordWriter
-from sensors_io.scenes.config import SceneConfig, config_hash
+from sensors_io.scenes.config import SceneConfig
 from sensors_io.schema import LEVELS
 from tests.experiments import tiny
 from tests.sensors_io import fakes
@@ -65,14 +66,21 @@ def test_records_and_encoders_that_changed_end_a_continued_run(tmp_path, records
         require_encoder(file, context)
 
 
-def test_generated_scenes_are_named_by_their_hash_and_made_once(tmp_path, cache_dir, records):
+def test_generated_scenes_are_made_once(tmp_path, cache_dir, records):
     shards = {p.name: p.stat().st_mtime_ns for p in records.glob("*.arrayrecord")}
     context = Context(tmp_path, cache_dir, Console(quiet=True))
     path = prepare_records(GENERATED, context)
     context.close()
-    assert path == cache_dir / f"scenes-{config_hash(tiny.SCENES)}" == records
+    assert path == records
     assert {p.name: p.stat().st_mtime_ns for p in records.glob("*.arrayrecord")} == shards
     assert set(context.timing()) == {"data"}
+
+
+def test_scenes_that_other_settings_compute_are_others(monkeypatch, records, cache_dir):
+    """Before, whoever made them first decided the bits of every later study."""
+    assert scenes_folder(cache_dir, tiny.SCENES) == records
+    monkeypatch.setenv(numerics.FLAGS, "--xla_cpu_enable_fast_math=true")
+    assert scenes_folder(cache_dir, tiny.SCENES) != records
 
 
 def test_other_scenes_lie_elsewhere(monkeypatch, context):
