@@ -202,7 +202,7 @@ def _work(
         if changes := numerics.changed(machine, {**numerics.machine(), **numerics.settings()}):
             raise DataError(
                 f"this worker computes other bits than the driver ({', '.join(changes)}): the study would not take its "
-                "policies; use workers of the driver's kind"
+                "policies; use workers of the driver's kind, or for cores alone set NPROC to one number for all of them"
             )
         logging.getLogger("orbax").setLevel(logging.ERROR)
         folder.mkdir(parents=True, exist_ok=True)
