@@ -188,7 +188,8 @@ def _begin(cores: Sequence[int], of_driver: int) -> None:
     """Keep this worker to some cores, and have it end when its driver does, even if that is killed."""
     if cores:
         os.sched_setaffinity(0, cores)
-        os.environ.setdefault("NPROC", str(of_driver))  # XLA adds up in as many parts as there: with the same bits
+        if not os.environ.get("NPROC"):
+            os.environ["NPROC"] = str(of_driver)  # XLA adds up in as many parts as there: with the same bits
     driver: Any = multiprocessing.parent_process()
     threading.Thread(target=lambda: os._exit(bool(driver.join())), daemon=True).start()
 

@@ -8,6 +8,7 @@ import contextlib
 import dataclasses
 import functools
 import logging
+import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -198,6 +199,8 @@ def _work(
     train: Train, part: StudyPart, cache_dir: Path, folder: Path, machine: Mapping[str, Any], quick: bool
 ) -> None:
     """Train one policy, in a worker; one that was killed goes on from its checkpoints."""
+    if "cores" in machine and not os.environ.get("NPROC"):  # read when JAX begins: as many parts of sums as there
+        os.environ["NPROC"] = machine["cores"]
     with compiled_quickly() if quick else contextlib.nullcontext(), compilations_kept(cache_dir / PROGRAMS):
         if changes := numerics.changed(machine, {**numerics.machine(), **numerics.settings()}):
             raise DataError(

@@ -11,7 +11,7 @@ from sensors_io.schema import Flag, Phase, Sequence
 _ARROWS = 16
 """Arrows of a vector field along its longer side."""
 
-_STILL_S = 5.0  # without a byte written, after which a disk takes no more
+_WAIT_S, MOST_WAITS = 5.0, 12  # without a byte written, after which a disk takes no more
 _STUCK: list[Any] = []
 """Recordings that a disk did not take: to close one, or to end with one, may wait for ever, deaf to Ctrl-C."""
 
@@ -58,14 +58,15 @@ def _flush(log: Any, file: pathlib.Path) -> None:
     Raises:
       RuntimeError: it could not be written.
     """
-    size = -1
+    size, still = -1, 0
     while True:
         try:
-            log.flush(timeout_sec=_STILL_S)
+            log.flush(timeout_sec=_WAIT_S)  # at once where the library writes no more
         except RuntimeError:
-            if (now := file.stat().st_size) == size:
+            now = file.stat().st_size
+            size, still = now, still + 1 if now == size else 0
+            if still == MOST_WAITS:
                 raise
-            size = now
         else:
             return
 

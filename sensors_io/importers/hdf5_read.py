@@ -128,7 +128,7 @@ def bounds(file: Any, group: str, rows: RowsMap) -> np.ndarray:
       HDF5Error: they are no ascending whole numbers.
     """
     stated_rows = dataset(file, group, rows.path, rows.kind)
-    _require_few(stated_rows.size, rows.path, rows.kind)
+    _require_few(stated_rows.size or 0, rows.path, rows.kind)
     found = np.asarray(stated_rows[()])
     whole = np.issubdtype(found.dtype, np.integer) and found.ndim == 1
     ends = found.astype(np.int64) if whole else np.zeros(1, np.int64)

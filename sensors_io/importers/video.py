@@ -108,7 +108,8 @@ def _dropped(path: pathlib.Path) -> int:
         while file.seek(start) and len(head := file.read(8)) == 8:
             kind, size = struct.unpack("<4sI", head)
             if kind == b"idx1":
-                rows = np.frombuffer(file.read(size // _INDEX.itemsize * _INDEX.itemsize), _INDEX)
+                data = file.read(size)  # perhaps less than that
+                rows = np.frombuffer(data[: len(data) // _INDEX.itemsize * _INDEX.itemsize], _INDEX)
                 found += int(((rows["bytes"] == 0) & np.isin(rows["kind"], (b"dc", b"db"))).sum())
             start += 8 + size + size % 2
     return found

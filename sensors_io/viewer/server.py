@@ -193,7 +193,7 @@ class LimitedServer(http.server.ThreadingHTTPServer):
             super().__init__(address, handler)
         except OSError as error:
             reason = f"{error.strerror}: {address[0]}:{address[1]}; name another --port, or 0 for a free one"
-            if error.errno not in (errno.EADDRINUSE, errno.EACCES):
+            if error.errno == errno.EADDRNOTAVAIL or isinstance(error, socket.gaierror):
                 reason = f"{error.strerror}: {address[0]}; must be an address of this machine, such as 127.0.0.1 or ::1"
             raise OSError(error.errno, reason) from error
         self._free = threading.Semaphore(_CONNECTIONS)

@@ -10,11 +10,13 @@ All must see the same run and cache directories, as over a network file system.
 import contextlib
 import dataclasses
 import fcntl
+import functools
 import glob
 import json
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -31,6 +33,9 @@ from touchr1_jax.training.loop import SingleDevice
 GIB = 2**30
 
 MOST_PROCESSES, MOST_PORT = 2**20, 2**16 - 1
+
+LOOK_S = 2.0
+"""Seconds after which a lock is taken to be that of a process of the run."""
 
 SAY_S, WAIT_S = 5.0, 300.0
 """Seconds after which a process says that it waits for the others of its run, and after which it ends."""
@@ -221,21 +226,39 @@ def _lock_number(launch: Launch, folder: Path) -> None:
     """
     address = f"-of-{launch.coordinator}".replace("/", "_")
     number = os.open(folder / f".process-{launch.process}{address}", os.O_CREAT | os.O_RDWR | os.O_CLOEXEC)
-    if not _locks(number):
+    if not _soon(lambda: _locks(number)):
         raise ProcessesNotFoundError(
             f"process is {launch.process}: another process has this number in the run at {launch.coordinator}; give "
             f"each its own, 0 … {(launch.processes or 1) - 1}, or wait for the other to end"
         )
     os.ftruncate(number, 0)
     os.pwrite(number, str(launch.processes).encode(), 0)
+    os.fsync(number)  # a network file system else shows others what was there before
     for path in folder.glob(f".process-*{glob.escape(address)}"):
-        with path.open("r+") as other:  # a network file system locks what may be written alone
-            stated = other.read()
-            if stated not in ("", str(launch.processes)) and not _locks(other.fileno()):
-                raise ProcessesNotFoundError(
-                    f"processes is {launch.processes}: another process of the run at {launch.coordinator} was given "
-                    f"{stated}; give all the same --processes, and each its own --process"
-                )
+        if not _soon(functools.partial(_agrees, path, str(launch.processes))):
+            raise ProcessesNotFoundError(
+                f"processes is {launch.processes}: another process of the run at {launch.coordinator} was given "
+                f"{path.read_text()}; give all the same --processes, and each its own --process"
+            )
+
+
+def _soon(found: Callable[[], bool]) -> bool:
+    """True once `found` is, in `LOOK_S` at most: others lock a file for a moment, to look at it."""
+    until = time.monotonic() + LOOK_S
+    while not found():
+        if time.monotonic() > until:
+            return False
+        time.sleep(0.02)
+    return True
+
+
+def _agrees(path: Path, processes: str) -> bool:
+    """False where a process that lives states another number of processes."""
+    try:
+        with path.open("r+") as other:  # a network file system locks only what may be written
+            return other.read() in ("", processes) or _locks(other.fileno())
+    except PermissionError:  # of another user
+        return True
 
 
 def _locks(number: int) -> bool:

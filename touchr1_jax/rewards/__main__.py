@@ -235,7 +235,8 @@ def terms_table(
 
     for slot, target in targets:
         total, parts, terms = score(target)
-        prove_rewards(rewards, weights, len(parsed.perceive), tuple(target.levels.tolist()), longest)
+        levels, ordinal = tuple(target.levels.tolist()), tuple(target.ordinal.tolist())
+        prove_rewards(rewards, weights, len(parsed.perceive), levels, longest, ordinal)
         for name, weight in weights.items():
             value, applies = terms[name]
             shown = f"{float(value):.3f}" if applies else NOT_DEFINED

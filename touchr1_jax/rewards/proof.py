@@ -26,8 +26,17 @@ IMPURE = (
 """What is wrong with a function of which `written` is another each time."""
 
 
+UNSTATED = ("None", "nan", str(np.iinfo(np.int32).min))
+"""What JAX writes of an element beyond an array, unless a reward states it by `mode="clip"` or `fill_value`."""
+
+
 def prove_rewards(
-    rewards: Mapping[str, AnyReward], names: Iterable[str], sensors: int, levels: tuple[int, ...], length: int = 20
+    rewards: Mapping[str, AnyReward],
+    names: Iterable[str],
+    sensors: int,
+    levels: tuple[int, ...],
+    length: int = 20,
+    ordinal: tuple[bool, ...] | None = None,
 ) -> None:
     """Evaluate rewards on extreme answers and targets; once for each reward and size.
 
@@ -45,6 +54,7 @@ def prove_rewards(
       sensors: S.
       levels: number of levels of each attribute; 1 where it is unknown.
       length: T, tokens of a completion.
+      ordinal: which attributes are; by default all.
 
     Raises:
       RewardError: NaN or infinity, with the answer and the target; another function each time; an index beyond an
@@ -53,7 +63,7 @@ def prove_rewards(
     for name in names:
         if not isinstance(rewards[name], HostReward):
             require_hash(f"reward {name!r}", rewards[name])
-            _prove(name, rewards[name], sensors, levels, length)
+            _prove(name, rewards[name], sensors, levels, length, ordinal or (True,) * len(levels))
 
 
 def require_hash(what: str, reward: object) -> None:
@@ -70,13 +80,21 @@ def require_hash(what: str, reward: object) -> None:
 
 
 @functools.cache
-def _prove(name: str, reward: Reward | GroupReward, sensors: int, levels: tuple[int, ...], length: int) -> None:
+def _prove(
+    name: str,
+    reward: Reward | GroupReward,
+    sensors: int,
+    levels: tuple[int, ...],
+    length: int,
+    ordinal: tuple[bool, ...],
+) -> None:
     with jax.ensure_compile_time_eval():
         answers, targets = _answers(sensors, len(levels)), _targets(sensors, len(levels))
         of_all = jax.jit(lambda answers, targets: _values(reward, answers, targets, length))
         values = np.asarray(of_all(answers, targets))
         _require_finite(name, values, answers, targets)
-        require_pure(f"reward {name!r}", reward.value, *_cases(reward, sensors, np.array(levels, np.int32), length))
+        cases = _cases(reward, sensors, np.array(levels, np.int32), length, np.array(ordinal))
+        require_pure(f"reward {name!r}", reward.value, *cases)
         if isinstance(reward, Reward) and reward.settled != SEGMENTS[-1]:
             changed = np.asarray(of_all(_changed_after(reward.settled, answers), targets))
             if not np.allclose(values, changed, rtol=1e-4, atol=1e-6):  # up to rounding
@@ -98,14 +116,16 @@ def _require_finite(name: str, values: np.ndarray, answers: Parsed, targets: Tar
         )
 
 
-def _cases(reward: Reward | GroupReward, sensors: int, levels: Any, length: int) -> Iterator[tuple[Any, ...]]:
+def _cases(
+    reward: Reward | GroupReward, sensors: int, levels: Any, length: int, ordinal: np.ndarray
+) -> Iterator[tuple[Any, ...]]:
     """Arguments of a reward: all attributes asked, or one, with the lowest or highest levels, no or all tokens."""
     each: Any = itertools.product((0 * levels, levels - 1), (0, length), (levels > 0, *np.eye(len(levels), dtype=bool)))
     array: Any = np.array  # these are no arrays of JAX, to compile nothing
     for level, tokens, asked in each:
         slots, ended, number = array([level] * sensors), array(tokens < length), array(tokens, np.int32)
         answer = Parsed(slots, level, level, formatted=ended, truncated=~ended, length=number)
-        target = Target(asked, level, levels, ordinal=levels > 0, streams=array([True] * sensors))
+        target = Target(asked, level, levels, array(ordinal), streams=array([True] * sensors))
         if isinstance(reward, GroupReward):
             yield np.zeros((2, length), np.int32), jax.tree.map(lambda x: np.stack([x, x]), answer), target
         else:
@@ -126,7 +146,9 @@ def require_pure(what: str, value: Callable[..., Any], *cases: tuple[Any, ...]) 
     once, again = written(value, *cases[0]), written(value, *cases[0])
     if once != again:
         raise RewardError(f"{what} {IMPURE}; compute from the arguments alone")
-    if not re.search(r"\b(gather|dynamic_slice)\[", once[0]):  # a constant index inside its array needs neither
+    gathers = re.findall(r"\bgather\[.*?fill_value=(\S+).*?mode=GatherScatterMode\.(\w+)", once[0], re.DOTALL)
+    unstated = [mode for fill, mode in gathers if mode != "CLIP" and fill in UNSTATED]
+    if not unstated and "dynamic_slice[" not in once[0]:  # a constant index inside its array needs neither
         return
     checked = jax.jit(checkify.checkify(value, errors=checkify.index_checks))
     for of in cases:

@@ -84,8 +84,9 @@ class WeightedScore:
         parsed = self.parser(tokens)
         reward, terms = total_reward(self.rewards, self.weights, parsed, target, tokens, self.decode)
         sensors, attributes = parsed.perceive.shape
-        levels = self.parser.levels if isinstance(self.parser, Parser) else (1,) * attributes
-        prove_rewards(self.rewards, self.weights, sensors, levels, tokens.shape[-1])
+        parser = self.parser
+        levels, ordinal = (parser.levels, parser.ordinal) if isinstance(parser, Parser) else ((1,) * attributes, None)
+        prove_rewards(self.rewards, self.weights, sensors, levels, tokens.shape[-1], ordinal)
         return reward, terms, parsed
 
     def segment_advantages(

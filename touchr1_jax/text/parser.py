@@ -16,6 +16,7 @@ Rules (tags, phrases and white space are defined in `lexer`):
 """
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -40,12 +41,17 @@ class Parser:
     sensors: int
     sensor_of: np.ndarray  # int32 [events], the sensor that an event names, −1 for none
     levels_of: np.ndarray  # int32 [events, A], bit k where an event names level k of an attribute
-    ordinal_levels: int  # most levels of an ordinal attribute, 0 without any
+    ordinal: tuple[bool, ...]  # of each attribute
 
     @property
     def levels(self) -> tuple[int, ...]:
         """Number of levels of each attribute."""
         return tuple(int(bits).bit_length() for bits in np.bitwise_or.reduce(self.levels_of, axis=0))
+
+    @property
+    def ordinal_levels(self) -> int:
+        """Most levels of an ordinal attribute, 0 without any."""
+        return max(itertools.compress(self.levels, self.ordinal), default=0)
 
     def __call__(self, tokens: Int[Array, "*T"]) -> Parsed:
         """Parse one completion; tokens from the first end token on are ignored.
@@ -150,7 +156,7 @@ def compile_parser(language: Language, tokenizer: Tokenizer) -> Parser:
         sensors=len(language.sensors),
         sensor_of=sensor_of,
         levels_of=levels_of,
-        ordinal_levels=max((len(a.levels) for a in language.attributes if a.ordinal), default=0),
+        ordinal=tuple(attribute.ordinal for attribute in language.attributes),
     )
 
 

@@ -171,9 +171,9 @@ def from_file(path: str | Path, *, vocab_size: int | None = None) -> Tokenizer:
         raise FileNotFoundError(f"{path} is no file: must be the tokenizer.json of a checkpoint; correct the path")
     try:
         library = tokenizers.Tokenizer.from_file(str(path))
-    except (KeyboardInterrupt, SystemExit):
-        raise
     except BaseException as error:  # the library raises nothing more particular; its panics are no `Exception`
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
         raise ValueError(f"{path} is no tokenizer ({error}): must be that of a checkpoint; fetch it again") from error
     return from_tokenizers(library, vocab_size=vocab_size)
 

@@ -117,7 +117,9 @@ def check_rewards(rewards: Mapping[str, AnyReward], weights: Mapping[str, float]
         lambda p, t, tokens: total_reward(rewards, weights, p, t, tokens, str), in_axes=(0, None, 0), axis_name=GROUP
     )
     jax.eval_shape(of_group, jax.tree.map(lambda x: x[None], parsed), target, jnp.zeros((1, 1), jnp.int32))
-    prove_rewards(rewards, weights, sensors, tuple(len(attribute.levels) for attribute in language.attributes))
+    levels = tuple(len(attribute.levels) for attribute in language.attributes)
+    ordinal = tuple(attribute.ordinal for attribute in language.attributes)
+    prove_rewards(rewards, weights, sensors, levels, ordinal=ordinal)
 
 
 @functools.cache

@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import jax
@@ -21,6 +22,7 @@ from experiments.core.metric_log import read_metrics
 from experiments.core.runner import Experiment, main, run_experiment
 from experiments.faults.trainings import PACKAGE
 from tests.experiments.fakes import coin
+from touchr1_jax.distributed import processes
 from touchr1_jax.distributed.processes import (
     SINGLE_PROCESS,
     Accelerators,
@@ -99,13 +101,14 @@ def test_one_process_asks_no_other(monkeypatch):
     ],
 )
 def test_numbers_that_do_not_fit_another_process_are_refused_before_jax_aborts_all(
-    number, stated, refusal, tmp_path, capsys
+    number, stated, refusal, tmp_path, capsys, monkeypatch
 ):
     """Before, a process that was started twice, or one too many, ended processes in a stack of C++."""
     folders = ["--runs-dir", str(tmp_path / "runs"), "--cache-dir", str(tmp_path)]
     launch = ["--distributed", "--coordinator", "127.0.0.1:1", "--processes", "2", "--process", "1"]
     (tmp_path / "compiled").mkdir()
     (tmp_path / "compiled" / ".process-7-of-127.0.0.1:1").write_text("8")  # of a run that has ended
+    monkeypatch.setattr(processes, "LOOK_S", 0.0)
     with (tmp_path / "compiled" / f".process-{number}-of-127.0.0.1:1").open("w") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
         other.write(stated)
@@ -113,6 +116,18 @@ def test_numbers_that_do_not_fit_another_process_are_refused_before_jax_aborts_a
         assert main(["small_study", "--scale", "short", *launch, *folders], package=PACKAGE) == 1
     assert refusal in capsys.readouterr().err
     assert not (tmp_path / "runs").exists()
+
+
+def test_files_of_an_earlier_run_refuse_nobody_while_others_look_at_them(tmp_path):
+    """Two that look at one file at a time find it locked; its owner states a new number only after it locked it."""
+    path = tmp_path / ".process-0-of-127.0.0.1:1"
+    path.write_text("8")
+    with path.open("r+") as looking:
+        fcntl.flock(looking, fcntl.LOCK_EX)
+        ended = threading.Timer(0.2, fcntl.flock, (looking, fcntl.LOCK_UN))
+        ended.start()
+        processes._lock_number(Launch(distributed=True, coordinator="127.0.0.1:1", processes=2, process=1), tmp_path)
+        ended.join()
 
 
 @pytest.mark.long

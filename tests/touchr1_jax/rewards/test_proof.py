@@ -117,6 +117,17 @@ def test_levels_may_be_looked_up(kind):
         prove_rewards({"mine": looked_up(short)}, ["mine"], S, LEVELS)
 
 
+def test_what_a_reward_states_of_other_elements_is_not_refused():
+    """`mode="clip"` states it; material is no ordinal attribute, whose levels alone need the table."""
+    price = jnp.array([0.0, 0.5, 1.0])
+    ordinal = Reward(lambda p, t: jnp.sum(price[jnp.where(t.ordinal, p.conclude, 0)]))
+    clipped = Reward(lambda p, t: jnp.sum(jnp.take(price, p.conclude, mode="clip")))
+    prove_rewards({"mine": ordinal}, ["mine"], S, LEVELS, ordinal=(True, True, True, False))
+    prove_rewards({"mine": clipped}, ["mine"], S, LEVELS)
+    with pytest.raises(RewardError, match="index 8 is out of bounds for axis 0 with size 3"):
+        prove_rewards({"mine": ordinal}, ["mine"], S, LEVELS)
+
+
 def test_an_index_by_the_longest_answer_is_checked():
     price = jnp.array([0.0, -0.5, -1.0])
     by_length = Reward(lambda p, t: price[jnp.searchsorted(jnp.array([5, 10, 15]), p.length)])

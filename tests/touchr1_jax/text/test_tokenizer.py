@@ -1,5 +1,6 @@
 import json
 import random
+from unittest.mock import Mock
 
 import hypothesis
 import hypothesis.strategies as st
@@ -95,6 +96,14 @@ def test_a_damaged_file_neither_panics_nor_asks_for_all_memory(tmp_path, part, d
     tree = json.loads(LIBRARY.to_str())
     (tmp_path / "tokenizer.json").write_text(json.dumps({**tree, part: damage}))
     with pytest.raises(ValueError, match=message):
+        from_file(tmp_path / "tokenizer.json")
+
+
+def test_a_signal_while_a_file_is_read_stays_a_signal(tmp_path, monkeypatch):
+    stopped = type("Stopped", (BaseException,), {})
+    (tmp_path / "tokenizer.json").write_text("{}")
+    monkeypatch.setattr(tokenizers, "Tokenizer", Mock(from_file=Mock(side_effect=stopped)))
+    with pytest.raises(stopped):
         from_file(tmp_path / "tokenizer.json")
 
 
