@@ -1,4 +1,4 @@
-"""Small JSON files that are whole or not there, and the checksum of a JSON object.
+"""Small files, JSON above all, that are whole or not there, and the checksum of a JSON object.
 
 A *sealed* object ends with the CRC-32 of the text before it, since a flipped bit on a disk raises no error of its own.
 Objects without this key, such as those of earlier versions, are read as well.
@@ -21,13 +21,22 @@ _VALUE = re.compile(r": ?([0-9]{1,10})\s*\}")  # of the last key, if it is a who
 
 def write_json(path: pathlib.Path, tree: Mapping[str, Any]) -> None:
     """Replace a file by JSON in one step; its folder is made if need be, for what is written was measured."""
+    write_whole(path, seal(json.dumps(tree, indent=1, allow_nan=False)).encode())
+
+
+def write_whole(path: pathlib.Path, data: bytes) -> None:
+    """Write a file by way of a temporary one in the same folder, so that no reader ever sees half of it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")  # another process may write the same file
-    with temporary.open("w", encoding="utf-8") as file:
-        file.write(seal(json.dumps(tree, indent=1, allow_nan=False)))
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    try:
+        with temporary.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
 
 
 def require_writable(path: pathlib.Path) -> None:

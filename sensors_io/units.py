@@ -163,7 +163,7 @@ def _local(launcher: Launcher) -> _Engine:
 
     def call(group: tuple[WorkUnit, ...]) -> dict[str, str]:
         if not hasattr(pools, "mine"):
-            pools.mine = concurrent.futures.ProcessPoolExecutor(1, context, _begin, (pools.cores, len(cores)))
+            pools.mine = concurrent.futures.ProcessPoolExecutor(1, context, _begin, (pools.cores,))
             made.append(pools.mine)
         try:
             return pools.mine.submit(_work, group, None, os.getcwd()).result()
@@ -184,12 +184,10 @@ def _local(launcher: Launcher) -> _Engine:
     return (BrokenProcessPool,), lambda groups: [threads.submit(call, group) for group in groups], close
 
 
-def _begin(cores: Sequence[int], of_driver: int) -> None:
+def _begin(cores: Sequence[int]) -> None:
     """Keep this worker to some cores, and have it end when its driver does, even if that is killed."""
     if cores:
         os.sched_setaffinity(0, cores)
-        if not os.environ.get("NPROC"):
-            os.environ["NPROC"] = str(of_driver)  # XLA adds up in as many parts as there: with the same bits
     driver: Any = multiprocessing.parent_process()
     threading.Thread(target=lambda: os._exit(bool(driver.join())), daemon=True).start()
 

@@ -2,13 +2,13 @@
 
 import concurrent.futures
 import math
-import os
 import resource
 from collections.abc import Callable, Iterable, Sequence
 from typing import TypeVar
 
 import jax
 
+from experiments.core import numerics
 from experiments.core.context import Context
 from experiments.core.memory import free_bytes
 from touchr1_jax.distributed.processes import GIB
@@ -90,7 +90,6 @@ def idle_cores(context: Context) -> int:
     alone = context.processes.count == 1 and math.prod(context.devices.shape) == 1
     if not alone or jax.default_backend() != "cpu":
         return 1
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     room = free_bytes() if limit == resource.RLIM_INFINITY else min(free_bytes(), limit)
-    return min(cores, 1 + max(0, room - ONE_SEED_BYTES) // SEED_BYTES)
+    return min(numerics.cores(), 1 + max(0, room - ONE_SEED_BYTES) // SEED_BYTES)

@@ -61,8 +61,6 @@ count where they differ."""
 DECODERS = "OPENCV_VIDEOIO_PRIORITY_"
 """Variables that begin so count too: each gives a decoder of OpenCV's its rank, or lists them."""
 
-_CHOSEN = hasattr(os, "sched_getaffinity")  # on Linux
-
 HARMLESS = ("--xla_force_host_platform_device_count", "--xla_dump", "--xla_hlo_profile")
 """Flags of XLA that change no result."""
 
@@ -107,12 +105,13 @@ def require_same(before: Mapping[str, Any] | None, where: object) -> None:
 def machine() -> dict[str, str]:
     """The kinds of device and of processor; where the processor is the device, its cores as XLA counts them."""
     device = jax.default_backend()
-    return {"device": device, "processor": processor()} | ({"cores": cores()} if device == "cpu" else {})
+    counted = {"cores": os.environ.get("NPROC") or str(cores())} if device == "cpu" else {}
+    return {"device": device, "processor": processor()} | counted
 
 
-def cores() -> str:
-    """Number of cores that this process may use, unless the variable NPROC states another to XLA."""
-    return os.environ.get("NPROC") or str(len(os.sched_getaffinity(0) if _CHOSEN else range(os.cpu_count() or 1)))
+def cores() -> int:
+    """Number of cores that this process may use; XLA counts them, unless the variable NPROC states a number."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> tuple[str, ...]:

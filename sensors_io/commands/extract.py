@@ -17,8 +17,9 @@ from sensors_io.fields.extract import ExtractConfig, Extractor, joined
 from sensors_io.fields.extracted_records import FieldsJob, write_extracted
 from sensors_io.fields.recorded import RestGel
 from sensors_io.fields.sources import SourceError, read_picture, read_pictures
-from sensors_io.fields.types import Calibration, CalibrationError, Fields, write_whole
+from sensors_io.fields.types import Calibration, CalibrationError, Fields
 from sensors_io.index import INDEX
+from sensors_io.json_files import write_whole
 from sensors_io.records import RecordStore
 from sensors_io.schema import Flag
 from sensors_io.units import Launcher

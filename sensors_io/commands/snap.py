@@ -17,8 +17,9 @@ from sensors_io.commands.console import OUT
 from sensors_io.devices.base import Device
 from sensors_io.devices.errors import DeviceDataError, DeviceNotFoundError, DeviceTimeoutError, StreamEndedError
 from sensors_io.fields.sources import read_picture
-from sensors_io.fields.types import CalibrationError, write_whole
+from sensors_io.fields.types import CalibrationError
 from sensors_io.index import INDEX
+from sensors_io.json_files import write_whole
 from sensors_io.locks import write_lock
 from sensors_io.viewer.server import LiveView, Numbers
 

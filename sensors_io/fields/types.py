@@ -18,6 +18,7 @@ import numpy as np
 from sensors_io.arrays import load_arrays
 from sensors_io.errors import MALFORMED, UserError
 from sensors_io.fields.slopes import ColourMap
+from sensors_io.json_files import write_whole
 from sensors_io.schema import SchemaError, Spec, check_arrays
 
 FIELD_ARRAYS: Mapping[str, Spec] = {
@@ -169,18 +170,3 @@ class Calibration:
         if found.hash != stated:
             raise CalibrationError(f"{path} was changed: its hash is {found.hash}, not {stated}; make it anew")
         return found
-
-
-def write_whole(path: pathlib.Path, data: bytes) -> None:
-    """Write a file by way of a temporary one in the same folder, so that no reader ever sees half of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:  # as readable as all that the user writes
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise

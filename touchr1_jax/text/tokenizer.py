@@ -14,7 +14,6 @@ from touchr1_jax.text.language import Language
 PAD, END, TACTILE, VIEW = "<pad>", "<end>", "<tactile>", "<view>"
 """Special tokens of the tokenizers made here; each adds nothing to the text."""
 
-
 MOST_IDS = 1 << 24
 """A hundred times the largest vocabulary; an id of 2³² in a damaged file would ask for 34 GB."""
 

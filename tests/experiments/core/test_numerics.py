@@ -129,7 +129,7 @@ def test_charts_need_no_window_whatever_the_environment_names():
 
 @pytest.mark.long
 @pytest.mark.skipif(
-    not hasattr(os, "sched_setaffinity") or numerics.cores() == "1", reason="a process cannot choose one core of two"
+    not hasattr(os, "sched_setaffinity") or numerics.cores() == 1, reason="a process cannot choose one core of two"
 )
 def test_cores_change_the_bits_of_large_sums_and_are_counted():
     source = (
