@@ -9,7 +9,7 @@ import importlib
 import re
 import symtable
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -43,10 +43,10 @@ def name_of(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def imports_of(tree: ast.AST, module: str) -> set[str]:
+def imports_of(nodes: Iterable[ast.AST], module: str) -> set[str]:
     """Dotted names that a source imports, anywhere in it; `from a import b` gives a.b, a module or a name in one."""
     found = set()
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         if isinstance(node, ast.ImportFrom):
@@ -69,9 +69,15 @@ def trees() -> dict[str, ast.Module]:
 
 
 @functools.cache
+def nodes() -> dict[str, list[ast.AST]]:
+    """Every node of each tree: a walk costs a second, and five rules need one."""
+    return {module: list(ast.walk(tree)) for module, tree in trees().items()}
+
+
+@functools.cache
 def imports() -> dict[str, set[str]]:
     """Names that each module imports."""
-    return {module: imports_of(tree, module) for module, tree in trees().items()}
+    return {module: imports_of(found, module) for module, found in nodes().items()}
 
 
 @functools.cache
@@ -142,8 +148,8 @@ def test_files_and_functions_are_short():
 
 
 def functions() -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
-    for module, tree in trees().items():
-        yield from ((module, n) for n in ast.walk(tree) if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef))
+    for module, found in nodes().items():
+        yield from ((module, n) for n in found if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef))
 
 
 MUTABLE = {
@@ -159,11 +165,10 @@ MUTABLE = {
 
 
 def classes() -> Iterator[tuple[str, ast.ClassDef]]:
-    for module, tree in trees().items():
-        yield from ((f"{module}.{n.name}", n) for n in ast.walk(tree) if isinstance(n, ast.ClassDef))
+    for module, found in nodes().items():
+        yield from ((f"{module}.{n.name}", n) for n in found if isinstance(n, ast.ClassDef))
 
 
-@pytest.mark.long
 def test_dataclasses_are_frozen():
     """Those of Flax are; `dataclasses.dataclass` says so, or its class is listed with a reason."""
     made = {name: [ast.unparse(d) for d in node.decorator_list] for name, node in classes()}
@@ -171,7 +176,6 @@ def test_dataclasses_are_frozen():
     assert {name for name in plain if not any("frozen=True" in d for d in made[name])} == MUTABLE.keys()
 
 
-@pytest.mark.long
 def test_class_names_are_unique():
     """One name, one thing: a reader who searches for a class finds it alone."""
     where = collections.defaultdict(list)
@@ -180,12 +184,11 @@ def test_class_names_are_unique():
     assert not {name: found for name, found in where.items() if len(found) > 1}
 
 
-@pytest.mark.long
 def test_docstrings_open_with_a_noun_or_a_verb():
     """Only the question of an experiment may open with What, Whether or How."""
     wrong = []
-    for module, tree in trees().items():
-        for node in ast.walk(tree):
+    for module, found in nodes().items():
+        for node in found:
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
                 first = (ast.get_docstring(node) or "").partition("\n")[0]
                 if re.match(r"(What|Whether|How)\b", first) and not first.endswith("?"):
@@ -242,10 +245,10 @@ def test_every_global_name_exists():
     assert not wrong
 
 
-def of_the_locale(tree: ast.AST) -> set[int]:
+def of_the_locale(nodes: Iterable[ast.AST]) -> set[int]:
     """Lines that read or write a text in the encoding of the user's locale, which in another one are other words."""
     found = set()
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
             texts = {"read_text": 0, "write_text": 1}.get(node.func.attr)
             if len(node.args) == texts and "encoding" not in {keyword.arg for keyword in node.keywords}:
@@ -253,19 +256,19 @@ def of_the_locale(tree: ast.AST) -> set[int]:
     return found
 
 
-@pytest.mark.long
 def test_texts_state_their_encoding():
-    assert not {module: lines for module, tree in trees().items() if (lines := of_the_locale(tree))}
+    assert not {module: lines for module, found in nodes().items() if (lines := of_the_locale(found))}
 
 
 def test_the_rules_see_what_they_forbid():
     """Also an import inside a function, and one by its parent package."""
     assert len(SOURCES) > 50
     hidden = ast.parse("def f():\n    from sensors_io import schema\n    import experiments.core.runs\n")
-    assert imports_of(hidden, "touchr1_jax.x") == {"sensors_io.schema", "experiments.core.runs"}
+    assert imports_of(ast.walk(hidden), "touchr1_jax.x") == {"sensors_io.schema", "experiments.core.runs"}
     assert not starts("sensors_io_extra", {"sensors_io"})
     with pytest.raises(AssertionError, match="relative import"):
-        imports_of(ast.parse("from . import schema"), "sensors_io.x")
+        imports_of(ast.walk(ast.parse("from . import schema")), "sensors_io.x")
     source = "import os\n\ndef f(x):\n    y = [os.sep for z in x]\n    return g(y, len(x), missing)\n"
     assert unknown_globals(source, {"os", "f", "g"}) == {"missing"}
-    assert of_the_locale(ast.parse("a.read_text()\na.read_text('utf-8')\na.write_text(x)\nwrite_text(a, x)")) == {1, 3}
+    texts = "a.read_text()\na.read_text('utf-8')\na.write_text(x)\nwrite_text(a, x)"
+    assert of_the_locale(ast.walk(ast.parse(texts))) == {1, 3}

@@ -238,7 +238,7 @@ def _lock_number(launch: Launch, folder: Path) -> None:
         if not _soon(functools.partial(_agrees, path, str(launch.processes))):
             raise ProcessesNotFoundError(
                 f"processes is {launch.processes}: another process of the run at {launch.coordinator} was given "
-                f"{path.read_text()}; give all the same --processes, and each its own --process"
+                f"{path.read_text(encoding='utf-8')}; give all the same --processes, and each its own --process"
             )
 
 
@@ -255,7 +255,7 @@ def _soon(found: Callable[[], bool]) -> bool:
 def _agrees(path: Path, processes: str) -> bool:
     """False where a process that lives states another number of processes."""
     try:
-        with path.open("r+") as other:  # a network file system locks only what may be written
+        with path.open("r+", encoding="utf-8") as other:  # a network file system locks only what may be written
             return other.read() in ("", processes) or _locks(other.fileno())
     except PermissionError:  # of another user
         return True
