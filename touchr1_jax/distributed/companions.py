@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+import jax
 from jax._src import distributed  # the key-value store of the coordination service has no public name
 from jax._src.lib import _jax
 
@@ -163,9 +164,11 @@ def different(here: Any, there: Any, name: str = "") -> list[str]:
 
 def _compare(count: int, index: int, about: Mapping[str, Any]) -> None:
     client: Any = distributed.global_state.client
-    client.key_value_set(f"{KEYS}/about/{index}", json.dumps(about))
+    with _answer_expected(f"process {index}"):
+        client.key_value_set(f"{KEYS}/about/{index}", json.dumps(about))
     for other in range(count):
-        found = json.loads(client.blocking_key_value_get(f"{KEYS}/about/{other}", round(1000 * COMPARE_S)))
+        with _answer_expected(f"process {other}"):
+            found = json.loads(client.blocking_key_value_get(f"{KEYS}/about/{other}", round(1000 * COMPARE_S)))
         lines = different(about, found)
         if lines:
             more = f" and {len(lines) - MOST_NAMED} more" if len(lines) > MOST_NAMED else ""
@@ -175,26 +178,46 @@ def _compare(count: int, index: int, about: Mapping[str, Any]) -> None:
             )
 
 
+@contextlib.contextmanager
+def _answer_expected(who: str) -> Iterator[None]:
+    """Say in one line that a process, inside the block, does not answer: it ended after it had joined the run.
+
+    Raises:
+      ConnectionError: the coordination service or a connection reports an error, or nothing for `COMPARE_S`.
+    """
+    try:
+        yield
+    except (jax.errors.JaxRuntimeError, OSError) as error:
+        raise ConnectionError(
+            f"{who} joined the run and did not answer for up to {COMPARE_S:g} s ({str(error).splitlines()[0]}): read "
+            "what it says in the end, then start all processes again"
+        ) from error
+
+
 def _connect(count: int, index: int) -> dict[int, socket.socket]:
     """Connections by the number of the other process: process 0 has one to each, the others one to process 0."""
     client: Any = distributed.global_state.client
     host = str(distributed.global_state.coordinator_address).rpartition(":")[0].strip("[]")
-    if index:
-        port = int(client.blocking_key_value_get(f"{KEYS}/port", round(1000 * COMPARE_S)))
-        found = {0: socket.create_connection((host, port), COMPARE_S)}
-        found[0].sendall(index.to_bytes(4, "big"))
-    else:
-        with socket.create_server(("", 0), backlog=count) as server:
-            server.settimeout(COMPARE_S)
-            client.key_value_set(f"{KEYS}/port", str(server.getsockname()[1]))
-            found = dict(_accepted(server) for _ in range(count - 1))
-    for connection in found.values():
-        connection.settimeout(None)
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)  # a machine may lose its power
+    with _answer_expected("process 0" if index else "one of the processes"):
+        if index:
+            port = int(client.blocking_key_value_get(f"{KEYS}/port", round(1000 * COMPARE_S)))
+            found = {0: socket.create_connection((host, port), COMPARE_S)}
+            found[0].sendall(index.to_bytes(4, "big"))
+        else:
+            with socket.create_server(("", 0), backlog=count) as server:
+                server.settimeout(COMPARE_S)
+                client.key_value_set(f"{KEYS}/port", str(server.getsockname()[1]))
+                found = dict(_accepted(server) for _ in range(count - 1))
+        for connection in found.values():
+            connection.settimeout(None)
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)  # a machine may lose its power
     return found
 
 
 def _accepted(server: socket.socket) -> tuple[int, socket.socket]:
     connection, _ = server.accept()
     connection.settimeout(COMPARE_S)
-    return int.from_bytes(connection.recv(4, socket.MSG_WAITALL), "big"), connection
+    index = connection.recv(4, socket.MSG_WAITALL)
+    if len(index) < 4:
+        raise ConnectionError("closed at once")
+    return int.from_bytes(index, "big"), connection

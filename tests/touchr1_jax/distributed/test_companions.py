@@ -7,9 +7,12 @@ import sys
 import time
 from pathlib import Path
 
+import jax
 import pytest
+from jax._src import distributed
 
-from touchr1_jax.distributed.companions import different
+from touchr1_jax.distributed import companions
+from touchr1_jax.distributed.companions import different, watched
 
 HERE = {"config": {"steps": 12, "sft": {"rate": 0.1}}, "code": "a1", "versions": {"jax": "0.10.2"}}
 
@@ -30,11 +33,37 @@ def test_what_differs_is_named_by_its_path(there, lines):
     assert different(HERE, there) == lines
 
 
-def start(home, *options, folders=(None, None)):
-    """Two processes of the training in `spread`, over loopback; each has options and a working directory of its own."""
+class Values(dict):
+    """Those of a coordination service."""
+
+    key_value_set = dict.__setitem__
+
+    def blocking_key_value_get(self, key, milliseconds):
+        if key not in self:
+            raise jax.errors.JaxRuntimeError(f"DEADLINE_EXCEEDED: {key} after {milliseconds} ms")
+        return self[key]
+
+
+def test_a_process_that_ends_after_joining_is_named(monkeypatch):
+    """Killed before it sent its settings, or before it connects; the first was a traceback of JAX."""
+    monkeypatch.setattr(distributed.global_state, "client", values := Values())
+    monkeypatch.setattr(companions, "COMPARE_S", 0.1)
+    with pytest.raises(ConnectionError, match=r"^process 1 joined the run and did not answer for up to 0.1 s \(DEAD"):
+        watched(2, 0, {"steps": 1}, str).__enter__()
+    values[f"{companions.KEYS}/about/1"] = '{"steps": 1}'
+    with pytest.raises(ConnectionError, match=r"^one of the processes joined .* \(timed out\)"):
+        watched(2, 0, {"steps": 1}, str).__enter__()
+
+
+def free_port():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
+        return free.getsockname()[1]
+
+
+def start(home, *options, folders=(None, None)):
+    """Two processes of the training in `spread`, over loopback; each has options and a working directory of its own."""
+    address = f"127.0.0.1:{free_port()}"
     command = [sys.executable, "-m", "tests.experiments.core.spread", "--runs-dir", home / "runs", "--cache-dir"]
     command += [home / "data", "--distributed", "--mesh.fsdp", "2", "--coordinator", address, "--processes", "2"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
