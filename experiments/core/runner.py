@@ -57,6 +57,7 @@ from touchr1_jax.models.layers import SizeError
 from touchr1_jax.models.load import WeightsError
 from touchr1_jax.rewards import RewardError
 from touchr1_jax.rl.served import RolloutError
+from touchr1_jax.rl.stream_check import StreamError
 from touchr1_jax.training.checkpoint import CheckpointError
 from touchr1_jax.training.compilation import compilations_kept, compiled_quickly
 from touchr1_jax.training.loop import NonFiniteGradientError
@@ -99,6 +100,7 @@ KNOWN_ERRORS = (
     RewardError,
     RolloutError,
     SizeError,
+    StreamError,
     WeightsError,
     OSError,
 )

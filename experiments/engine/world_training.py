@@ -44,7 +44,7 @@ from touchr1_jax.rl.losses import entropy, exact_kl, token_log_probs
 from touchr1_jax.rl.metrics import answer_metrics
 from touchr1_jax.rl.rollout import GRPOBatch, SampleConfig, encode_prompts, sample_prompts
 from touchr1_jax.rl.scoring import ScoreFn, make_score, reward_weights
-from touchr1_jax.rl.stream_check import check_streams
+from touchr1_jax.rl.stream_check import StreamError, check_streams
 from touchr1_jax.training.optimizer import falling_adamw
 from touchr1_jax.types import Params, Parsed, Rollout, Target
 
@@ -137,7 +137,7 @@ class VariantRun:
         try:
             for influence in np.stack([self.before[f"grounding_{s}"] for s in range(S)], 1):
                 check_streams(influence, np.ones(S, bool))
-        except ValueError:
+        except StreamError:
             return False
         return True
 

@@ -17,6 +17,10 @@ ROUNDING_NAT = 1e-7
 """Influence at which a stream counts as ignored: without attention it is 0 up to the rounding of float32."""
 
 
+class StreamError(ValueError):
+    """A policy that would be rewarded for touch which does not reach it; the message names the stream and the fix."""
+
+
 def stream_influence(
     fns: PolicyFns, params: Params, batch: GRPOBatch, noise: Float[Array, "K S N D"], key: Array, length: int
 ) -> tuple[Float[Array, "S"], Bool[Array, "S"]]:
@@ -58,16 +62,17 @@ def check_streams(influence: Float[np.ndarray, "S"], present: Bool[np.ndarray, "
     """Check that every present stream has an influence, and that there is any.
 
     Raises:
-      ValueError: no prompt has touch; noise in a stream changes the answers by no more than the rounding of float32.
+      StreamError: no prompt has touch; noise in a stream changes the answers by no more than the rounding of float32.
     """
     if not np.any(present):
-        raise ValueError(
+        raise StreamError(
             "stream_mask is false for every prompt and stream: no prompt of the first batch has touch, so that rewards "
             "for touch and G_tg mean nothing; look at the masks of the records and of the encoder"
         )
     for s, (size, there) in enumerate(zip(influence, present, strict=True)):
         if there and not size > ROUNDING_NAT:
-            raise ValueError(
+            raise StreamError(
                 f"stream {s}: noise in it moves the answers by {size:.3g} nat a token, must exceed {ROUNDING_NAT:g}; "
-                "its touch does not reach the policy: look at its encoder, its slots in the prompt and its mask"
+                f"the recordings of sensor {s} (from 0) never change: leave it out; or its touch does not reach the "
+                "policy: look at its encoder, its slots in the prompt and its mask"
             )

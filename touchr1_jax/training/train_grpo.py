@@ -65,8 +65,8 @@ def train_grpo(
       held_out: as in `train_sft`.
 
     Raises:
-      ValueError: `held_out` without checkpoints, a first batch without touch, a stream whose touch does not reach the
-        policy, lean compilation on several devices; as `RolloutServer.check`.
+      ValueError: `held_out` without checkpoints, lean compilation on several devices; as `RolloutServer.check`.
+      StreamError: a first batch without touch, a stream whose touch does not reach the policy.
       RolloutError: as `RolloutServer.rollouts`.
     """
     constraint = policy.constraint if config.algorithm.constrained else None
@@ -163,7 +163,8 @@ def check_whole_batch(
     """`check_streams` on all rows of the first batch, so that all processes decide alike.
 
     Raises:
-      ValueError: as `check_streams`; lean compilation on several devices, which would compile without it.
+      StreamError: as `check_streams`.
+      ValueError: lean compilation on several devices, which would compile without it.
     """
     if config.lean_compilation and hooks.devices.shape != SingleDevice.shape:
         raise ValueError(f"lean_compilation is True: must be False on a mesh of {hooks.devices.shape}; leave it out")

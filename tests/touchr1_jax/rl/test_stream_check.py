@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.touchr1_jax import tiny
-from touchr1_jax.rl.stream_check import ROUNDING_NAT, check_streams, stream_influence
+from touchr1_jax.rl.stream_check import ROUNDING_NAT, StreamError, check_streams, stream_influence
 
 pytestmark = pytest.mark.long
 
@@ -38,7 +38,7 @@ def test_a_stream_of_constants_is_refused(influence):
     size, present = jax.device_get(influence(batch, wire(NOISE)))
     assert size[0] > 1e-4
     assert size[1] <= ROUNDING_NAT
-    with pytest.raises(ValueError, match=r"stream 1: noise in it moves the answers by .* its touch does not reach"):
+    with pytest.raises(StreamError, match=r"stream 1: noise in it moves the answers by .* its touch does not reach"):
         check_streams(size, present)
 
 
@@ -48,16 +48,16 @@ def test_a_stream_that_is_hidden_from_attention_is_refused_and_one_that_is_absen
     assert size[0] <= ROUNDING_NAT
     assert present.tolist() == [False, True]
     check_streams(size, present)
-    with pytest.raises(ValueError, match="stream 0"):
+    with pytest.raises(StreamError, match="stream 0"):
         check_streams(size, np.array([True, True]))
 
 
 def test_a_batch_without_any_touch_is_refused():
     """No stream is present, so that none can be found silent."""
-    with pytest.raises(ValueError, match="no prompt of the first batch has touch"):
+    with pytest.raises(StreamError, match="no prompt of the first batch has touch"):
         check_streams(np.zeros(2), np.zeros(2, bool))
 
 
 def test_a_divergence_that_is_no_number_is_refused():
-    with pytest.raises(ValueError, match="stream 0"):
+    with pytest.raises(StreamError, match="stream 0"):
         check_streams(np.array([np.nan]), np.array([True]))
