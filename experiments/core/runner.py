@@ -279,8 +279,7 @@ def short_help(text: str) -> str:
     own = [name for name in entries if "." not in name and name not in OF_RUNNER]
     chosen = [name for name in dict.fromkeys((*FIRST, *own)) if name in entries][:MOST_OPTIONS]
     left = ", ".join(f"--{name}" for name in entries if "." not in name and name not in chosen)
-    groups = {"others": (str(left.count("--")), left), **groups}
-    further = aligned([(title, *of) for title, of in groups.items()])
+    further = aligned([("others", str(left.count("--")), left), *((title, *of) for title, of in groups.items())])
     head = "Options that matter first:"
     return "\n".join((before.rstrip(), "", head, *(entries[n] for n in chosen), "", f"More, with {HELP_ALL}:", further))
 

@@ -4,7 +4,8 @@ import dataclasses
 import hashlib
 import json
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
+from collections.abc import Sequence as Seq
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from experiments.core.context import Context
 from experiments.core.errors import DataError
 from sensors_io.pipeline import ClipConfig, ClipMemory, clip_batches
 from sensors_io.records import RecordStore
-from sensors_io.schema import ATTRIBUTES, LEVELS
+from sensors_io.schema import ATTRIBUTES, LEVELS, Sequence
 from touchr1_jax.types import TouchBatch
 
 PARTS = ("sft", "grpo", "val", "test")
@@ -29,7 +30,7 @@ class Dataset:
     learn from the same contacts.  `label` is int32 [contact, A].  Every seed reads the same clips, so `memory` keeps
     them; `threads` read those of the batches to come.  `statistics` are all contacts as the statistics stem of an
     encoder reads them, by the side of its patches, once a stage has computed them.  `has_force` says whether the force
-    of the first contact was measured, which stands for all.
+    of any contact was measured.
     """
 
     store: RecordStore
@@ -115,7 +116,7 @@ def require_same_records(data: Dataset, context: Context) -> None:
     )
 
 
-def split_parts(store: RecordStore, grpo_share: float | None, left_out: Sequence[int] = ()) -> dict[str, np.ndarray]:
+def split_parts(store: RecordStore, grpo_share: float | None, left_out: Seq[int] = ()) -> dict[str, np.ndarray]:
     """Contact indices of each part; a `grpo_share` of the training objects is kept from SFT for GRPO.
 
     Without a share both stages learn from all of them.  `DataError` if no object has a label, or a part no contact.
@@ -143,18 +144,25 @@ def split_parts(store: RecordStore, grpo_share: float | None, left_out: Sequence
     return parts
 
 
+def has_measured_force(contact: Mapping[str, Sequence]) -> bool:
+    """True if any sensor measured the force of a contact."""
+    return any(sequence.force_n is not None for sequence in contact.values())
+
+
 def open_dataset(
     path: Path,
     clip: ClipConfig,
     grpo_share: float | None,
     memory_gib: float = 0.0,
     threads: int = 1,
-    left_out: Sequence[int] = (),
+    left_out: Seq[int] = (),
     content: str = "",
+    has_force: bool | None = None,
 ) -> Dataset:
     """Open records and split them without the contacts that are left out.
 
-    `memory_gib` of their clips stay in memory once so many threads have read them; `content` as of `Dataset`.
+    `memory_gib` of their clips stay in memory once so many threads have read them; `content` and `has_force` as of
+    `Dataset`, the latter by default as of the first contact.
     """
     store = RecordStore(path)
     clip = dataclasses.replace(clip, sensors=store.meta.sensors)
@@ -167,7 +175,7 @@ def open_dataset(
         label=np.stack([card.label_row() for card in cards]),
         object_ids=np.array([card.object_id for card in cards]),
         visual_lies=np.array([bool(card.visual_lies) for card in cards]),
-        has_force=any(sequence.force_n is not None for sequence in store.contact(0).values()),
+        has_force=has_measured_force(store.contact(0)) if has_force is None else has_force,
         threads=threads,
         content=content,
     )

@@ -8,14 +8,14 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from experiments.core import numerics
 from experiments.core.context import Context
 from experiments.core.progress import ProgressCallback
-from experiments.study.dataset import Dataset, open_dataset, require_same_records
+from experiments.study.dataset import Dataset, has_measured_force, open_dataset, require_same_records
 from sensors_io.generate import generate_records
 from sensors_io.importers.catalogue import import_catalogue
 from sensors_io.importers.physiclear import PhysiclearConfig, list_physiclear
@@ -95,29 +95,39 @@ def open_source(
     `ConfigurationError` if they are others than the run began with.
     """
     path = prepare_records(config, context)
-    odd, content = survey_contacts(config, path, context, clip.rejected)
-    data = open_dataset(path, clip, grpo_share, memory_gib, threads, odd if config.drop_odd else (), content)
+    found = survey_contacts(config, path, context, clip.rejected)
+    left_out = found.odd if config.drop_odd else ()
+    data = open_dataset(path, clip, grpo_share, memory_gib, threads, left_out, found.content, found.has_force)
     require_same_records(data, context)
     for line in data.levels() if config.data != "generated" else ():
         context.print(line)
     return data
 
 
+class SurveyedContacts(NamedTuple):
+    """Findings of a reading of every contact of recordings; of scenes nothing, as their configuration decides it."""
+
+    odd: tuple[int, ...] = ()  # contacts that teach nothing about touch
+    content: str = ""  # hash of all that was recorded
+    has_force: bool | None = None
+
+
 def survey_contacts(
     config: SourceConfig, path: Path, context: Context, rejected: Collection[Flag] = ()
-) -> tuple[tuple[int, ...], str]:
-    """Contacts of recordings that teach nothing about touch, printed by reason, and a hash of all that was recorded.
+) -> SurveyedContacts:
+    """Read every contact of recordings and print, by reason, those that teach nothing about touch.
 
-    Scenes have neither: their configuration decides what they hold.  `rejected` are the flags of frames that no clip
-    shows where a sequence has others.
+    `rejected` are the flags of frames that no clip shows where a sequence has others.
     """
     if config.data == "generated":
-        return (), ""
+        return SurveyedContacts()
     store, reasons, content = RecordStore(path), dict[str, dict[int, str]](), hashlib.sha256()
-    views = [card.view for card in store.objects.values()]
     alike, films = dict[str, dict[str, int]](), {sensor: Counter[str]() for sensor in store.meta.sensors}
+    with_force = 0
     for i in context.each("looking for odd contacts", range(len(store))):
-        for sensor, sequence in store.contact(i).items():
+        contact = store.contact(i)
+        with_force += has_measured_force(contact)
+        for sensor, sequence in contact.items():
             films.setdefault(sensor, Counter())[_film(sequence)] += 1
             for reason in (odd := oddities(sequence, rejected=rejected)):
                 reasons.setdefault(reason, {})[i] = sequence.name
@@ -137,6 +147,23 @@ def survey_contacts(
     what = "are left out" if config.drop_odd else "are trained on (option drop-odd leaves them out)"
     for reason, named in sorted(reasons.items()):
         context.print(f"{reason}: {len(named)} of {len(store)} contacts {what}: {_listed([*named.values()])}")
+    _print_incomplete(store, with_force, context)
+    _add_arrays(content, [card.view for card in store.objects.values()])
+    return SurveyedContacts(
+        tuple(sorted({i for rows in reasons.values() for i in rows})), content.hexdigest()[:16], with_force > 0
+    )
+
+
+def _print_incomplete(store: RecordStore, with_force: int, context: Context) -> None:
+    """Print how many contacts and objects lack something that others have."""
+    with_view = sum(card.view is not None for card in store.objects.values())
+    parts = (
+        ("measured force", with_force, len(store), "contacts"),
+        ("picture", with_view, len(store.objects), "objects"),
+    )
+    for what, n, count, kind in parts:
+        if 0 < n < count:
+            context.print(f"{what}: {n} of {count} {kind}; the others are learned and asked without it")
     touched = {key.object_id for key in store.contacts}
     bare = {
         "contact": sorted(store.objects.keys() - touched),
@@ -145,8 +172,6 @@ def survey_contacts(
     for what, names in bare.items():
         if names:
             context.print(f"without any {what}: {len(names)} of {len(store.objects)} objects, such as {names[0]}")
-    _add_arrays(content, views)
-    return tuple(sorted({i for rows in reasons.values() for i in rows})), content.hexdigest()[:16]
 
 
 def _add_arrays(content: "hashlib._Hash", arrays: Iterable[np.ndarray | None]) -> None:

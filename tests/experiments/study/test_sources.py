@@ -15,7 +15,7 @@ from experiments.core.context import Context
 from experiments.core.errors import ConfigurationError, DataError
 from experiments.encoder.pretrain import StageOneDataConfig, open_touch
 from experiments.study import sources
-from experiments.study.sources import SourceConfig, prepare_records, scenes_folder, survey_contacts
+from experiments.study.sources import SourceConfig, SurveyedContacts, prepare_records, scenes_folder, survey_contacts
 from experiments.study.training import open_data, require_encoder
 from sensors_io.cards import replace_cards
 from sensors_io.commands.label import Label
@@ -137,11 +137,15 @@ def test_odd_contacts_of_recordings_are_listed_before_training_and_left_out_on_r
     with RecordWriter(tmp_path / "odd", meta=store.meta) as writer:
         for card in store.objects.values():
             writer.write_object(card)
-        writer.write_object(dataclasses.replace(store.objects[store.contacts[0].object_id], object_id="untouched"))
+        writer.write_object(
+            dataclasses.replace(store.objects[store.contacts[0].object_id], object_id="untouched", view=None)
+        )
         for i in range(len(store)):
             sequences = list(store.contact(i).values())
             if i == black:
                 sequences[0] = dataclasses.replace(sequences[0], frames=np.zeros_like(sequences[0].frames))
+            if i == 0:  # its force stood for that of all
+                sequences = [dataclasses.replace(x, force_n=None) for x in sequences]
             if i == copy:
                 sequences = [dataclasses.replace(x, key=store.contacts[i]) for x in store.contact(first).values()]
             writer.write_contact(sequences)
@@ -149,10 +153,14 @@ def test_odd_contacts_of_recordings_are_listed_before_training_and_left_out_on_r
         writer.write_contact([dataclasses.replace(x, key=again) for x in store.contact(first).values()])
     count = len(store) + 1
     config = StageOneDataConfig(data="records", data_dir=tmp_path / "odd")
-    assert survey_contacts(config, tmp_path / "odd", context)[0] == tuple(sorted((first, black, copy, count - 1)))
-    parts = open_touch(dataclasses.replace(config, drop_odd=True), 2, 16, context).parts
+    assert survey_contacts(config, tmp_path / "odd", context).odd == tuple(sorted((first, black, copy, count - 1)))
+    opened = open_touch(dataclasses.replace(config, drop_odd=True), 2, 16, context)
+    assert opened.has_force
+    parts = opened.parts
     assert set(np.concatenate(list(parts.values()))) == set(range(len(store))) - {first, black, copy}
     printed = context.console.file.getvalue()
+    assert f"measured force: {count - 1} of {count} contacts; the others " in printed
+    assert f"picture: {len(store.objects)} of {len(store.objects) + 1} objects; the others " in printed
     assert f"all pictures black: 1 of {count} contacts are trained on (option drop-odd leaves them out)" in printed
 
     assert f"the same recording twice: 3 of {count} contacts are left out: " in printed
@@ -162,7 +170,7 @@ def test_odd_contacts_of_recordings_are_listed_before_training_and_left_out_on_r
     for part, rows in (("training", train[2:-1]), ("test", store.contacts_of_split("test"))):
         levels = [store.objects[store.contacts[i].object_id].labels["hardness"] for i in rows]
         assert f"{part} {levels.count(0)}, {levels.count(1)}, {levels.count(2)}" in hardness
-    assert survey_contacts(GENERATED, store.path, context) == ((), "")
+    assert survey_contacts(GENERATED, store.path, context) == SurveyedContacts()
 
 
 def test_recordings_that_differ_in_a_time_or_a_view_are_others(data, tmp_path, context):
@@ -175,7 +183,7 @@ def test_recordings_that_differ_in_a_time_or_a_view_are_others(data, tmp_path, c
                 writer.write_object(card(each))
             for i in range(len(store)):
                 writer.write_contact([sequence(x) for x in store.contact(i).values()])
-        return survey_contacts(StageOneDataConfig(data="records", data_dir=tmp_path), tmp_path / name, context)[1]
+        return survey_contacts(StageOneDataConfig(data="records", data_dir=tmp_path), tmp_path / name, context).content
 
     later = lambda x: dataclasses.replace(x, host_time_ns=x.host_time_ns + (np.arange(len(x)) == len(x) - 1))
     darker = lambda x: dataclasses.replace(x, view=x.view // 2)
