@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import json
 import threading
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as Seq
 from pathlib import Path
@@ -69,6 +70,14 @@ class Dataset:
                 of_part = np.bincount(level[level >= 0], minlength=LEVELS[name])
                 counts.append(f"{part} {', '.join(map(str, of_part))}")
             yield f"{name}, objects of levels 0 to {LEVELS[name] - 1}: {'; '.join(counts)}"
+
+    def unlearned_sensors(self) -> Iterator[str]:
+        """For each part that is asked the sensors in it that touched no training contact."""
+        learned = {sensor for i in self.training for sensor in self.store.sensors_of(i)}
+        for part in ("val", "test"):
+            count = Counter(sensor for i in self.parts[part] for sensor in self.store.sensors_of(i))
+            for sensor in sorted(count.keys() - learned):
+                yield f"{sensor}: in {count[sensor]} of {len(self.parts[part])} contacts of {part}, in none of training"
 
     def prior(self) -> np.ndarray:
         """Frequency of each level among the labels of training contacts, float32 [A, K]; padding levels have 0.

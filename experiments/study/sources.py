@@ -6,7 +6,7 @@ import hashlib
 import json
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -24,7 +24,7 @@ from sensors_io.pipeline import ClipConfig
 from sensors_io.quality import oddities, recorded_digest
 from sensors_io.records import RecordStore
 from sensors_io.scenes.config import SceneConfig, config_hash
-from sensors_io.schema import FRAME_ARRAYS, Flag, Sequence
+from sensors_io.schema import FRAME_ARRAYS, Flag, ObjectCard, Sequence
 
 Source = Literal["generated", "physiclear", "records"]
 
@@ -99,7 +99,7 @@ def open_source(
     left_out = found.odd if config.drop_odd else ()
     data = open_dataset(path, clip, grpo_share, memory_gib, threads, left_out, found.content, found.has_force)
     require_same_records(data, context)
-    for line in data.levels() if config.data != "generated" else ():
+    for line in (*data.levels(), *data.unlearned_sensors()) if config.data != "generated" else ():
         context.print(line)
     return data
 
@@ -147,31 +147,28 @@ def survey_contacts(
     what = "are left out" if config.drop_odd else "are trained on (option drop-odd leaves them out)"
     for reason, named in sorted(reasons.items()):
         context.print(f"{reason}: {len(named)} of {len(store)} contacts {what}: {_listed([*named.values()])}")
-    _print_incomplete(store, with_force, context)
-    _add_arrays(content, [card.view for card in store.objects.values()])
+    _print_incomplete(store, cards := dict(store.objects), with_force, context)
+    _add_arrays(content, [card.view for card in cards.values()])
     return SurveyedContacts(
         tuple(sorted({i for rows in reasons.values() for i in rows})), content.hexdigest()[:16], with_force > 0
     )
 
 
-def _print_incomplete(store: RecordStore, with_force: int, context: Context) -> None:
+def _print_incomplete(store: RecordStore, cards: Mapping[str, ObjectCard], with_force: int, context: Context) -> None:
     """Print how many contacts and objects lack something that others have."""
-    with_view = sum(card.view is not None for card in store.objects.values())
-    parts = (
-        ("measured force", with_force, len(store), "contacts"),
-        ("picture", with_view, len(store.objects), "objects"),
-    )
-    for what, n, count, kind in parts:
+    views = {name: card.view for name, card in cards.items() if card.view is not None}
+    some = ("measured force", with_force, len(store), "contacts"), ("picture", len(views), len(cards), "objects")
+    for what, n, count, kind in some:
         if 0 < n < count:
             context.print(f"{what}: {n} of {count} {kind}; the others are learned and asked without it")
-    touched = {key.object_id for key in store.contacts}
-    bare = {
-        "contact": sorted(store.objects.keys() - touched),
-        "label": [n for n, card in store.objects.items() if card.split != "unlabelled" and max(card.label_row()) < 0],
+    found = {
+        "without any contact": sorted(cards.keys() - {key.object_id for key in store.contacts}),
+        "without any label": [n for n, c in cards.items() if c.split != "unlabelled" and max(c.label_row()) < 0],
+        "picture of one colour": [name for name, view in views.items() if not np.ptp(view, (0, 1)).any()],
     }
-    for what, names in bare.items():
+    for what, names in found.items():
         if names:
-            context.print(f"without any {what}: {len(names)} of {len(store.objects)} objects, such as {names[0]}")
+            context.print(f"{what}: {len(names)} of {len(cards)} objects, such as {names[0]}")
 
 
 def _add_arrays(content: "hashlib._Hash", arrays: Iterable[np.ndarray | None]) -> None:

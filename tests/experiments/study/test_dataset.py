@@ -67,6 +67,16 @@ def test_the_prior_is_that_of_training_labels_alone(data):
     np.testing.assert_allclose(prior, hand, atol=1e-7)
 
 
+def test_a_sensor_that_no_training_contact_has_is_named(tmp_path):
+    """Objects 0 and 1 train; a policy has never seen what it is asked about by the second sensor."""
+    with fakes.RecordWriter(tmp_path, meta=fakes.META) as writer:
+        for n in range(4):
+            writer.write_object(fakes.card(n))
+            writer.write_contact([fakes.sequence(n, sensor) for sensor in SENSORS[: 2 if n == 3 else 1]])
+    data = open_dataset(tmp_path, ClipConfig(), None)
+    assert list(data.unlearned_sensors()) == ["xense: in 1 of 1 contacts of test, in none of training"]
+
+
 def test_records_are_opened_with_their_own_sensors_labels_and_forces(tmp_path):
     path = fakes.write(tmp_path / "forces", contacts=8, sensors=SENSORS[:2])
     data = open_dataset(path, ClipConfig(sensors=SENSORS[:1]), 0.5)

@@ -137,9 +137,9 @@ def test_odd_contacts_of_recordings_are_listed_before_training_and_left_out_on_r
     with RecordWriter(tmp_path / "odd", meta=store.meta) as writer:
         for card in store.objects.values():
             writer.write_object(card)
-        writer.write_object(
-            dataclasses.replace(store.objects[store.contacts[0].object_id], object_id="untouched", view=None)
-        )
+        untouched = dataclasses.replace(store.objects[store.contacts[0].object_id], object_id="untouched", view=None)
+        writer.write_object(untouched)
+        writer.write_object(dataclasses.replace(untouched, object_id="unseen", view=np.zeros((4, 4, 3), np.uint8)))
         for i in range(len(store)):
             sequences = list(store.contact(i).values())
             if i == black:
@@ -160,11 +160,12 @@ def test_odd_contacts_of_recordings_are_listed_before_training_and_left_out_on_r
     assert set(np.concatenate(list(parts.values()))) == set(range(len(store))) - {first, black, copy}
     printed = context.console.file.getvalue()
     assert f"measured force: {count - 1} of {count} contacts; the others " in printed
-    assert f"picture: {len(store.objects)} of {len(store.objects) + 1} objects; the others " in printed
+    assert f"picture: {len(store.objects) + 1} of {len(store.objects) + 2} objects; the others " in printed
     assert f"all pictures black: 1 of {count} contacts are trained on (option drop-odd leaves them out)" in printed
 
     assert f"the same recording twice: 3 of {count} contacts are left out: " in printed
-    assert f"without any contact: 1 of {len(store.objects) + 1} objects, such as untouched" in printed
+    assert f"without any contact: 2 of {len(store.objects) + 2} objects, such as unseen" in printed
+    assert f"picture of one colour: 1 of {len(store.objects) + 2} objects, such as unseen" in printed
     assert f"gelsight_mini: {count} of 28 × 28 at " in printed
     (hardness,) = (line for line in printed.splitlines() if line.startswith("hardness, objects of levels 0 to 2: "))
     for part, rows in (("training", train[2:-1]), ("test", store.contacts_of_split("test"))):
