@@ -51,6 +51,7 @@ from touchr1_jax.distributed.processes import (
     ProcessGroup,
     join_processes,
     require_accelerators,
+    require_common_folders,
     select_devices,
 )
 from touchr1_jax.models.layers import SizeError
@@ -305,9 +306,7 @@ def _execute(experiment: Experiment[Any], command: Any, about: str, typed: str) 
             require_accelerators(command.scale, experiment.needs.get(command.scale))
             chosen, resumed = processes.broadcast(lambda: _directory(experiment, command, typed))
             directory = Path(chosen)
-            if not (directory / "config.json").exists():  # in another working directory, or on a disk of its own
-                what = f"process {processes.index} does not see {directory.absolute()}, the run of process 0"
-                raise DifferentProcessesError(f"{what}: all must share runs-dir and cache-dir; give whole paths")
+            require_common_folders(command.launch, processes, directory, command.cache_dir / COMPILED)
             lock = runs.locked(directory) if processes.writes else contextlib.nullcontext()
             with stopping.listening(), lock, compilations_kept(command.cache_dir / COMPILED):
                 if processes.writes:

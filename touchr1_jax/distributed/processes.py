@@ -23,9 +23,10 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax._src import distributed
 from jax.experimental import multihost_utils
 
-from touchr1_jax.distributed.companions import STDERR, coordination_apart
+from touchr1_jax.distributed.companions import STDERR, DifferentProcessesError, coordination_apart
 from touchr1_jax.distributed.mesh import MeshConfig
 from touchr1_jax.distributed.placement import DeviceMesh
 from touchr1_jax.training.loop import SingleDevice
@@ -216,7 +217,28 @@ def join_processes(
             f"--distributed finds no other processes ({error}): start them with srun, mpirun or as an indexed "
             "Kubernetes job, or give --coordinator HOST:PORT --processes N --process I in each"
         ) from error
-    return ProcessGroup(jax.process_count(), jax.process_index())
+    known = distributed.global_state  # `jax.process_count` would exchange devices, and wait for a process that ended
+    return ProcessGroup(known.num_processes, known.process_id)
+
+
+def require_common_folders(launch: Launch, processes: ProcessGroup, run: Path, cache: Path) -> None:
+    """Check that this process sees the run's configuration, and the file of process 0 in the cache.
+
+    Raises:
+      DifferentProcessesError: it is in another working directory, or on a disk of its own.
+    """
+    seen = [run / "config.json"] + [_number_file(launch, cache, 0)] * (launch.coordinator is not None)
+    for file in seen:
+        if not file.exists():
+            raise DifferentProcessesError(
+                f"process {processes.index} does not see {file.absolute()}, which process 0 has written: all must "
+                "share runs-dir and cache-dir; give whole paths"
+            )
+
+
+def _number_file(launch: Launch, folder: Path, process: int | None) -> Path:
+    """File that a process locks; one of another run at the same address stays there, unlocked."""
+    return folder / f".process-{process}-of-{launch.coordinator}".replace("/", "_")
 
 
 def _lock_number(launch: Launch, folder: Path) -> None:
@@ -224,8 +246,8 @@ def _lock_number(launch: Launch, folder: Path) -> None:
 
     Where two have one number, or one states fewer processes than there are, JAX aborts with a stack of C++.
     """
-    address = f"-of-{launch.coordinator}".replace("/", "_")
-    number = os.open(folder / f".process-{launch.process}{address}", os.O_CREAT | os.O_RDWR | os.O_CLOEXEC)
+    file = _number_file(launch, folder, launch.process)
+    number = os.open(file, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC)
     if not _soon(lambda: _locks(number)):
         raise ProcessesNotFoundError(
             f"process is {launch.process}: another process has this number in the run at {launch.coordinator}; give "
@@ -234,7 +256,7 @@ def _lock_number(launch: Launch, folder: Path) -> None:
     os.ftruncate(number, 0)
     os.pwrite(number, str(launch.processes).encode(), 0)
     os.fsync(number)  # a network file system else shows others what was there before
-    for path in folder.glob(f".process-*{glob.escape(address)}"):
+    for path in folder.glob(".process-*-of-" + glob.escape(file.name.partition("-of-")[2])):
         if not _soon(functools.partial(_agrees, path, str(launch.processes))):
             raise ProcessesNotFoundError(
                 f"processes is {launch.processes}: another process of the run at {launch.coordinator} was given "

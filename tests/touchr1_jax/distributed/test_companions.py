@@ -95,11 +95,14 @@ def test_fresh_in_one_process_alone_is_named(tmp_path):
 
 
 @pytest.mark.slow
-def test_processes_without_a_common_folder_are_named(tmp_path):
+@pytest.mark.parametrize("common", ["--runs-dir", "--cache-dir"])
+def test_processes_without_a_common_folder_are_named(tmp_path, common):
     for folder in (folders := (tmp_path / "a", tmp_path / "b")):
         folder.mkdir()
-    first, second = start(Path(), [], [], folders=folders)
-    assert f"DifferentProcessesError: process 1 does not see {folders[1] / 'runs' / 'spread'}" in errors(second)
+    options = [common, str(tmp_path / "common")]
+    first, second = start(Path(), options, options, folders=folders)
+    other = {"--cache-dir": Path("runs", "spread"), "--runs-dir": Path("data", "compiled", ".process-0-of-127.0.0.1:")}
+    assert f"DifferentProcessesError: process 1 does not see {folders[1] / other[common]}" in errors(second)
     assert errors(first).startswith("Process 1 of this run ended early, so process 0 ends too.")
 
 
