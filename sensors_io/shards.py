@@ -63,6 +63,7 @@ class ShardWriter:
         found = reader.num_records() if reader.ok() else 0
         reader.close()
         if found < self._count:
+            self._remove()
             raise RecordsError(f"{self._path}: {found} of {self._count} entries reached the disk; check its free space")
         with self._temporary.open("rb") as file:
             os.fsync(file.fileno())
@@ -74,10 +75,16 @@ class ShardWriter:
         try:
             yield
         except RuntimeError as error:
+            self._remove()
             raise RecordsError(
                 f"{self._path} cannot be written ({error}): free some space, or make its folder writable; what was "
                 "published before is kept, and the same command goes on"
             ) from error
+
+    def _remove(self) -> None:
+        """Remove the temporary file, which nobody would look for if the same command is not run again."""
+        with contextlib.suppress(OSError):  # the folder cannot be written, which is what the caller reports
+            self._temporary.unlink(missing_ok=True)
 
 
 class Entries:

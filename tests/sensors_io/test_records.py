@@ -130,6 +130,7 @@ class TestInterrupted:
         monkeypatch.setattr(ArrayRecordWriter, "write", lambda self, data: None)
         refused(records.RecordsError, "0 of 1 entries reached the disk", fakes.write, tmp_path / "full", 1)
         assert len(RecordStore(tmp_path / "full", allow_incomplete=True)) == 0
+        assert not list((tmp_path / "full").glob(".objects-*.tmp"))
 
     def test_a_killed_writer_keeps_every_published_contact(self, tmp_path):
         code = f"""

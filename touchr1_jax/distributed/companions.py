@@ -36,6 +36,9 @@ COMPARE_S = 60.0
 GRACE_S = 5.0
 """Time for this process to meet and report the error that ended another one."""
 
+END_S = 15.0
+"""Time for a process to end by itself after its error."""
+
 ERROR_WAIT_S = 2.0
 """Time after an error in which the end of another process, which may be its cause, is noticed."""
 
@@ -102,8 +105,15 @@ class Companions:
             thread.start()
 
     def leave(self, word: bytes) -> None:
-        """Say the last word to the others and wait for theirs."""
+        """Say the last word to the others and wait for theirs; after an error, end within `END_S`.
+
+        Threads may wait for the others, whom nothing tells that this process failed, as in a checkpoint's barrier.
+        """
         self._left = True
+        if word == FAILED:
+            end = threading.Timer(END_S, os._exit, (1,))
+            end.daemon = True
+            end.start()
         for connection in self._connections.values():
             with contextlib.suppress(OSError):  # it ended: its thread knows
                 connection.sendall(word)

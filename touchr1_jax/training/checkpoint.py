@@ -7,7 +7,6 @@ because a flipped bit on a disk raises no error.  A damaged checkpoint is set as
 import contextlib
 import itertools
 import json
-import logging
 import math
 import shutil
 import sys
@@ -24,6 +23,7 @@ from jax.experimental import multihost_utils
 from jaxtyping import Array, UInt32
 from orbax.checkpoint.checkpoint_managers import AnyPreservationPolicy, BestN, LatestN
 
+from touchr1_jax.training.background_saves import FAILURES, failed_save, wait_for_save
 from touchr1_jax.training.checksums import CHECKSUMS, changed_files, file_checksums, old_checkpoints
 
 MOST_SAID = 240
@@ -34,9 +34,6 @@ _OVERHEAD_BYTES = 256 * 1024
 
 _MIX = 0x9E3779B1
 """2³² over the golden ratio, odd: multiples of it spread over all 32 bits (Knuth, TAOCP 3, §6.4)."""
-
-_FAILURES = (OSError, ValueError, KeyError, TypeError, RuntimeError, AssertionError, AttributeError, IndexError)
-"""What Orbax and TensorStore raise where bytes cannot be read or written: they name no class of their own."""
 
 _SAVES = threading.Lock()
 """Of the thread that saves: Orbax numbers the saves of a process, and mixes up those of two threads."""
@@ -57,15 +54,6 @@ class Restored(NamedTuple):
     state: Any
     data: Any
     best: tuple[int, float] | None = None
-
-
-def _not_of_a_failed_save(record: logging.LogRecord) -> bool:
-    """False of what a save logs of its failure, which it raises in one line, and of a score that it lacks at a stop."""
-    quiet = record.levelno < logging.ERROR and "tracked_metric" not in str(record.msg)
-    return quiet or "/orbax/" not in record.pathname
-
-
-logging.getLogger("absl").addFilter(_not_of_a_failed_save)
 
 
 def _complain(text: str) -> None:
@@ -122,7 +110,7 @@ class Checkpoints:
             self._remove_old(keep)
             self._set_aside_unscored()
             self._manager = ocp.CheckpointManager(self._directory, options=options)
-        except _FAILURES as error:
+        except FAILURES as error:
             raise CheckpointError(
                 f"{self._directory}: its checkpoints cannot be opened ({_brief(error)}); make the folder writable, or "
                 "move it away to train this stage from its beginning"
@@ -133,11 +121,12 @@ class Checkpoints:
 
     def __exit__(self, *exc: object) -> None:
         try:
-            self._manager.wait_until_finished()
-        except _FAILURES as error:
+            wait_for_save(self._manager, self._directory)
+        except FAILURES as error:
             raise self._unsaved(error) from error
         finally:
-            self._manager.close()
+            if jax.process_count() == 1 or failed_save(self._directory) is None:
+                self._manager.close()
 
     def save(self, step: int, state: Any, data: Any, score: float | None = None) -> None:
         """Save a pytree of arrays and a JSON value as checkpoint `step`; writing goes on in the background.
@@ -169,13 +158,13 @@ class Checkpoints:
         others = threading.current_thread() is not threading.main_thread()
         self._before_save()
         try:
-            self._manager.wait_until_finished()
+            wait_for_save(self._manager, self._directory)
             self._saving = step
             with _SAVES if others else contextlib.nullcontext():
                 self._manager.save(step, args=args, metrics=None if score is None else {"score": score})
                 if others:
                     self._manager.wait_until_finished()
-        except _FAILURES as error:
+        except FAILURES as error:
             raise self._unsaved(error) from error
 
     def latest(self) -> int | None:
@@ -271,7 +260,7 @@ class Checkpoints:
             kept = {name: value for name, value in found.data.items() if name != "crc32"}
             data, digests = kept["data"], kept["digests"]
             intact = found.data["crc32"] == _crc32(kept)
-        except _FAILURES as error:
+        except FAILURES as error:
             if self._readable(step):
                 raise CheckpointError(
                     f"{where} holds another state than the one that is trained: {_brief(error)}; go back to the code "
@@ -305,7 +294,7 @@ class Checkpoints:
         """True if the checkpoint is readable, whatever its structure."""
         try:
             self._restored(step)
-        except _FAILURES:
+        except FAILURES:
             return False
         return True
 

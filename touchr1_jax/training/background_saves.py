@@ -1,0 +1,60 @@
+"""Saves of Orbax in the background: errors that they log, and the end of one for which several processes wait."""
+
+import concurrent.futures
+import logging
+import threading
+from pathlib import Path
+
+import jax
+import orbax.checkpoint as ocp
+
+FAILURES = (OSError, ValueError, KeyError, TypeError, RuntimeError, AssertionError, AttributeError, IndexError)
+"""What Orbax and TensorStore raise where bytes cannot be read or written: they name no class of their own."""
+
+LOOK_S = 0.2
+
+_FAILED: list[tuple[str, Exception]] = []
+"""What Orbax logged of each save that failed, and the error."""
+
+
+def _not_of_a_failed_save(record: logging.LogRecord) -> bool:
+    """False of what a save logs of its failure, which it raises in one line, and of a score that it lacks at a stop."""
+    quiet = record.levelno < logging.ERROR and "tracked_metric" not in str(record.msg)
+    if quiet or "/orbax/" not in record.pathname:
+        return True
+    if record.exc_info and isinstance(record.exc_info[1], FAILURES):
+        _FAILED.append((record.getMessage(), record.exc_info[1]))
+    return False
+
+
+logging.getLogger("absl").addFilter(_not_of_a_failed_save)
+
+
+def failed_save(directory: Path) -> Exception | None:
+    """The error of a save into a directory that failed in this process."""
+    return next((error for text, error in _FAILED if f"{directory}/" in text), None)
+
+
+def wait_for_save(manager: ocp.CheckpointManager, directory: Path) -> None:
+    """Wait for the save in the background, and raise its error.
+
+    Where a save fails in one process of several, Orbax waits there for the others, which wait for it.  Then this raises
+    at once, nothing may wait for the manager any more, and the process must end.
+    """
+    if jax.process_count() == 1:
+        manager.wait_until_finished()
+        return
+    finished = concurrent.futures.Future[None]()
+
+    def wait() -> None:
+        try:
+            finished.set_result(manager.wait_until_finished())
+        except BaseException as error:
+            finished.set_exception(error)
+
+    threading.Thread(target=wait, daemon=True).start()
+    while not finished.done():
+        if error := failed_save(directory):
+            raise error
+        concurrent.futures.wait([finished], LOOK_S)
+    finished.result()
