@@ -6,7 +6,7 @@ import hashlib
 import json
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -24,7 +24,7 @@ from sensors_io.pipeline import ClipConfig
 from sensors_io.quality import oddities, recorded_digest
 from sensors_io.records import RecordStore
 from sensors_io.scenes.config import SceneConfig, config_hash
-from sensors_io.schema import FRAME_ARRAYS, Flag, ObjectCard, Sequence
+from sensors_io.schema import FRAME_ARRAYS, Flag, Sequence
 
 Source = Literal["generated", "physiclear", "records"]
 
@@ -147,28 +147,36 @@ def survey_contacts(
     what = "are left out" if config.drop_odd else "are trained on (option drop-odd leaves them out)"
     for reason, named in sorted(reasons.items()):
         context.print(f"{reason}: {len(named)} of {len(store)} contacts {what}: {_listed([*named.values()])}")
-    _print_incomplete(store, cards := dict(store.objects), with_force, context)
-    _add_arrays(content, [card.view for card in cards.values()])
+    _survey_objects(store, content, with_force, context)
     return SurveyedContacts(
         tuple(sorted({i for rows in reasons.values() for i in rows})), content.hexdigest()[:16], with_force > 0
     )
 
 
-def _print_incomplete(store: RecordStore, cards: Mapping[str, ObjectCard], with_force: int, context: Context) -> None:
-    """Print how many contacts and objects lack something that others have."""
-    views = {name: card.view for name, card in cards.items() if card.view is not None}
-    some = ("measured force", with_force, len(store), "contacts"), ("picture", len(views), len(cards), "objects")
-    for what, n, count, kind in some:
-        if 0 < n < count:
-            context.print(f"{what}: {n} of {count} {kind}; the others are learned and asked without it")
-    found = {
-        "without any contact": sorted(cards.keys() - {key.object_id for key in store.contacts}),
-        "without any label": [n for n, c in cards.items() if c.split != "unlabelled" and max(c.label_row()) < 0],
-        "picture of one colour": [name for name, view in views.items() if not np.ptp(view, (0, 1)).any()],
-    }
+def _survey_objects(store: RecordStore, content: "hashlib._Hash", with_force: int, context: Context) -> None:
+    """Add the pictures of the objects to the hash, and print what contacts and objects lack that others have."""
+    touched, with_view = {key.object_id for key in store.contacts}, 0
+    found: dict[str, list[str]] = {"without any contact": [], "without any label": [], "picture of one colour": []}
+    for name, card in store.objects.items():
+        _add_arrays(content, [card.view])
+        with_view += card.view is not None
+        unlabelled = card.split != "unlabelled" and max(card.label_row()) < 0
+        for names, holds in zip(found.values(), (name not in touched, unlabelled, _is_even(card.view)), strict=True):
+            if holds:
+                names.append(name)
+    count = len(store.objects)
+    some = ("measured force", with_force, len(store), "contacts"), ("picture", with_view, count, "objects")
+    for what, n, of, kind in some:
+        if 0 < n < of:
+            context.print(f"{what}: {n} of {of} {kind}; the others are learned and asked without it")
     for what, names in found.items():
         if names:
-            context.print(f"{what}: {len(names)} of {len(cards)} objects, such as {names[0]}")
+            context.print(f"{what}: {len(names)} of {count} objects, such as {names[0]}")
+
+
+def _is_even(picture: np.ndarray | None) -> bool:
+    """True of a picture of one colour."""
+    return picture is not None and not np.ptp(picture, (0, 1)).any()
 
 
 def _add_arrays(content: "hashlib._Hash", arrays: Iterable[np.ndarray | None]) -> None:

@@ -105,20 +105,20 @@ class Companions:
             thread.start()
 
     def leave(self, word: bytes) -> None:
-        """Say the last word to the others and wait for theirs; after an error, end within `END_S`.
+        """Say the last word to the others and wait for theirs; after an error, end within `END_S` of it.
 
-        Threads may wait for the others, whom nothing tells that this process failed, as in a checkpoint's barrier.
+        Threads of this process may wait for the others for ever, as in a checkpoint's barrier.
         """
         self._left = True
-        if word == FAILED:
-            end = threading.Timer(END_S, os._exit, (1,))
-            end.daemon = True
-            end.start()
         for connection in self._connections.values():
             with contextlib.suppress(OSError):  # it ended: its thread knows
                 connection.sendall(word)
         for thread in self._threads:
             thread.join()
+        if word == FAILED:
+            end = threading.Timer(END_S, os._exit, (1,))
+            end.daemon = True
+            end.start()
         if self._alone:
             atexit.register(os._exit, 1)  # before JAX, which would wait for the process that is gone
 

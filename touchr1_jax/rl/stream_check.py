@@ -73,6 +73,6 @@ def check_streams(influence: Float[np.ndarray, "S"], present: Bool[np.ndarray, "
         if there and not size > ROUNDING_NAT:
             raise StreamError(
                 f"stream {s}: noise in it moves the answers by {size:.3g} nat a token, must exceed {ROUNDING_NAT:g}; "
-                f"the recordings of sensor {s} (from 0) never change: leave it out; or its touch does not reach the "
-                "policy: look at its encoder, its slots in the prompt and its mask"
+                f"either the recordings of sensor {s} (from 0) never change: leave it out; or its touch does not reach "
+                "the policy: look at its encoder, its slots in the prompt and its mask"
             )

@@ -164,7 +164,7 @@ def test_odd_contacts_of_recordings_are_listed_before_training_and_left_out_on_r
     assert f"all pictures black: 1 of {count} contacts are trained on (option drop-odd leaves them out)" in printed
 
     assert f"the same recording twice: 3 of {count} contacts are left out: " in printed
-    assert f"without any contact: 2 of {len(store.objects) + 2} objects, such as unseen" in printed
+    assert f"without any contact: 2 of {len(store.objects) + 2} objects, such as untouched" in printed
     assert f"picture of one colour: 1 of {len(store.objects) + 2} objects, such as unseen" in printed
     assert f"gelsight_mini: {count} of 28 × 28 at " in printed
     (hardness,) = (line for line in printed.splitlines() if line.startswith("hardness, objects of levels 0 to 2: "))
