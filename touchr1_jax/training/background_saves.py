@@ -2,8 +2,11 @@
 
 import concurrent.futures
 import logging
+import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import orbax.checkpoint as ocp
@@ -27,7 +30,18 @@ def _not_of_a_failed_save(record: logging.LogRecord) -> bool:
     return False
 
 
+def without_closed_loops(report: Callable[[Any], object]) -> Callable[[Any], object]:
+    """A `sys.unraisablehook` that omits TensorStore's threads, which find the event loop of a failed save closed."""
+
+    def hook(lost: Any) -> None:
+        if not (lost.object is None and repr(lost.exc_value) == "RuntimeError('Event loop is closed')"):
+            report(lost)
+
+    return hook
+
+
 logging.getLogger("absl").addFilter(_not_of_a_failed_save)
+sys.unraisablehook = without_closed_loops(sys.unraisablehook)
 
 
 def failed_save(directory: Path) -> Exception | None:

@@ -1,5 +1,6 @@
 """Waiting for a save of which one process of several knows that it failed."""
 
+import asyncio
 import logging
 import threading
 import types
@@ -8,7 +9,7 @@ import jax
 import pytest
 
 from touchr1_jax.training import background_saves
-from touchr1_jax.training.background_saves import failed_save, wait_for_save
+from touchr1_jax.training.background_saves import failed_save, wait_for_save, without_closed_loops
 
 
 @pytest.fixture(autouse=True)
@@ -43,3 +44,17 @@ def test_an_error_of_the_wait_itself_is_raised(tmp_path):
 
     with pytest.raises(ValueError, match="timed out"):
         wait_for_save(types.SimpleNamespace(wait_until_finished=fail), tmp_path)
+
+
+def test_a_thread_that_finds_the_event_loop_of_a_failed_save_closed_is_not_reported():
+    """A full disk made up to 173 tracebacks of one save."""
+    loop = asyncio.new_event_loop()
+    loop.close()
+    with pytest.raises(RuntimeError) as closed:
+        loop.call_soon_threadsafe(print)
+    lost = [(None, closed.value), ("a callback of the user's", closed.value), (None, RuntimeError("another"))]
+    lost = [types.SimpleNamespace(object=where, exc_value=error) for where, error in lost]
+    reported = []
+    for one in lost:
+        without_closed_loops(reported.append)(one)
+    assert reported == lost[1:]
