@@ -284,7 +284,7 @@ def _cross_matrix(v: np.ndarray) -> np.ndarray:
 def _solve(design: np.ndarray, seen: np.ndarray, poses: int) -> tuple[np.ndarray, float]:
     if design.shape[0] < design.shape[1] or np.linalg.cond(design) > _WORST_CONDITION:
         raise ForceError(
-            f"down holds {poses} poses that do not tell bias from weight: turn the sensor in more directions"
+            f"down holds {poses} poses that do not separate bias from weight: turn the sensor in more directions"
         )
     solution = np.linalg.lstsq(design, seen, rcond=None)[0]
     return solution, float(np.sqrt(np.mean((design @ solution - seen) ** 2)))

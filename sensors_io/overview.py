@@ -115,7 +115,7 @@ def object_table(store: RecordStore) -> Table:
 
 
 def flag_table(counts: FlagCounts, title: str = "flags") -> Table:
-    """Frames by quality flag and sensor; a frame may carry several, and a dot says that nothing could tell."""
+    """Frames by quality flag and sensor; a frame may carry several, and a dot means that it could not be checked."""
     sensors = list(counts.frames)
     table = Table("frames", *sensors, title=title)
     table.add_row("all", *(str(counts.frames[sensor]) for sensor in sensors), end_section=True)

@@ -16,7 +16,7 @@ from sensors_io.errors import MALFORMED, name_and_text
 from sensors_io.force import ForceError, GravityModel, fit_gravity, gravity_directions
 from sensors_io.json_files import read_json, write_json
 
-_LEAST_READINGS = 8  # in a stretch: fewer tell no spread
+_LEAST_READINGS = 8  # in a stretch: fewer show no spread
 _UNIT = 1e-3  # by which the length of a direction may differ from 1
 
 

@@ -148,7 +148,7 @@ class Mirror:
             total -= bytes_
 
     def files(self) -> dict[str, str]:
-        """File → MD5 where the store tells one, of its folders too; nothing where the folder does not exist yet."""
+        """File → MD5 where the store states one, of its folders too; empty where the folder does not exist yet."""
 
         def listed() -> dict[str, dict[str, Any]]:
             with contextlib.suppress(FileNotFoundError):

@@ -19,7 +19,7 @@ Shown = Literal["pictures", "fields"]
 FIELD_MM_PER_COUNT = 1.5 / 127
 """Scale of field images: count = 128 + mm / (1.5 mm / 127), so that ±1.5 mm fill the range and one count is 11.8 µm."""
 
-_PROBE_ROWS = 16  # rows of the subsampled frames that tell how much changes
+_PROBE_ROWS = 16  # rows of the subsampled frames that show how much changes
 
 
 def choose_frames(sequence: Sequence, count: int, rejected: Seq[Flag], by: Chooser = "auto") -> np.ndarray:

@@ -105,7 +105,7 @@ class CounterStep:
       missing: samples that never came between the last one and this; −1 takes back one that was counted in error.
       duplicate: it was seen before.
       late: it had been counted as missing.
-      restarted: the device counts from the beginning again, so that its counter does not tell what was lost.
+      restarted: the device counts from the beginning again, so that its counter does not show what was lost.
     """
 
     missing: int = 0

@@ -23,7 +23,7 @@ NO_SENSOR = 255
 """Number in a row that stands for no further sensor."""
 
 SHARD = np.dtype([("number", "<u4"), ("entries", "<u4"), ("bytes", "<u8")])
-"""One ArrayRecord file: the number in its name, its entries, and its size, which tells a truncated file at once."""
+"""One ArrayRecord file: the number in its name, its entries, and its size, which shows if it is truncated."""
 
 _CHUNK = 1 << 24
 _MIX = tuple(np.uint64(x) for x in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB, 0xD6E8FEB86659FD93))

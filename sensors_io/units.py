@@ -173,7 +173,7 @@ def _local(launcher: Launcher) -> _Engine:
 
     def close() -> None:
         threads.shutdown(wait=False, cancel_futures=True)
-        while True:  # a worker may be starting while the driver is told to end
+        while True:  # a worker may be starting while the driver is asked to end
             running = any(thread.is_alive() for thread in threads._threads)
             for process in itertools.chain(*(list((pool._processes or {}).values()) for pool in list(made))):
                 process.terminate()

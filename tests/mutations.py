@@ -19,7 +19,7 @@ INPUTS = 4_000
 
 SLOWEST_S = 1.0
 MEMORY = 10
-"""Times the input, beside two megabytes for what Python itself takes."""
+"""Times the input, besides two megabytes for what Python itself takes."""
 
 NUMBERS = (b"0", b"-1", b"1e999", b"NaN", b"99999999999999999999", b"null", b"{}", b"[]", b'""', b"true")
 ODD = (0, -1, 0.5, 2**63, 10**400, float("nan"), float("inf"), None, True, "", "x", [], [[1]], {}, {"x": 1})

@@ -26,7 +26,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory) -> Path:
-    """Folder of wheel and sdist, built from a copy, since setuptools leaves files beside the sources."""
+    """Folder of wheel and sdist, built from a copy, since setuptools leaves files among the sources."""
     folder = tmp_path_factory.mktemp("sources")
     for package in PACKAGES:
         shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))

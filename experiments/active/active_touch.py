@@ -14,7 +14,7 @@ look-ahead; a policy that chooses without seeing its observations; every touch; 
 `--physiclear DIR` adds real touch: several videos of an object as contacts, and a policy that learns when to stop.
 `--agents` adds PPO of Stable-Baselines3 in the same environment.
 
-For each object, some sensors and motions are missing at random, and policies are not told which: a touch with a missing
+For each object, some sensors and motions are missing at random, and policies do not know which: a touch with a missing
 one takes its time and returns nothing.
 
 Cost: 24 to 28 minutes on two cores, six to eight of them for the contacts, which are made once; `--scale smoke` two.

@@ -115,7 +115,7 @@ class ContactsConfig:
 class ContactBank:
     """Every contact of every object.
 
-    `frames` are the pictures with the fields below them, `harm` tells where the strain limit was passed, `label` is the
+    `frames` are the pictures with the fields below them, `harm` marks where the strain limit was passed, `label` is the
     level of each of `PROPERTIES`.
     """
 
@@ -189,7 +189,7 @@ def kept_frames(sequence: Sequence, config: ContactsConfig) -> UInt8[np.ndarray,
 
 
 def recorded_frames(sequence: Sequence, config: ContactsConfig) -> UInt8[np.ndarray, "F H W 3"]:
-    """The frames that are kept of a recording, whose phases nothing tells: those that stand for it."""
+    """The frames that are kept of a recording, whose phases are unknown: those that stand for it."""
     chosen = salient_frames(sequence, config.moments, ())
     if len(chosen) < config.moments:
         raise SchemaError(f"{sequence.name} has {len(chosen)} frames: must have {config.moments}; record longer")

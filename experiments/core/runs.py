@@ -201,8 +201,8 @@ def read_description(directory: Path) -> dict[str, Any]:
 def labelled(directory: Path, name: str) -> str:
     """Name, experiment and configuration that a file of a run states, so that one of another run is not taken for it.
 
-    A folder without `config.json`, such as a unit of work, is told from others by its own name; one in the folder of a
-    run, such as a part of it, by the run too.
+    A folder without `config.json`, such as a unit of work, is distinguished from others by its own name; one in the
+    folder of a run, such as a part of it, by the run too.
     """
     about: Any = directory.name
     kind, above = operator.itemgetter("experiment", "config"), directory.parent / "config.json"

@@ -173,7 +173,7 @@ def watch(
 ) -> FeedMeasurement:
     """Time some batches of a feed, then run it with a simulated device; `warm` batches are drawn first.
 
-    `stage` is scale, stage and source, by slashes; `configured` tells if the scale's study would feed it so.
+    `stage` is scale, stage and source, by slashes; `configured` says if the scale's study would feed it so.
     """
 
     def measure() -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""The smallest good inputs, and ways to damage them."""
+"""The smallest good inputs, and functions that damage them."""
 
 import contextlib
 import io

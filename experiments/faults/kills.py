@@ -222,7 +222,7 @@ def _session(arguments: list[str], log: str, programs: str) -> None:
     file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     for stream in (sys.stdout.fileno(), sys.stderr.fileno()):
         os.dup2(file, stream)
-    # read with the first program: the older of XLA's two ways to write a loop compiles twice as fast
+    # read with the first program: the older of XLA's two code generators for a loop compiles twice as fast
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_FAST_COMPILATION}".strip()
     for name, value in (_JAX_CONFIG | {"jax_compilation_cache_dir": programs}).items():
         jax.config.update(name, value)

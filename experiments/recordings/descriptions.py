@@ -165,7 +165,7 @@ def _describe_files(
 
 
 def _state(file: Path) -> tuple[int, ...]:
-    """Size and time of a file, by which another in its place is told from it; nothing of one that is not there."""
+    """Size and time of a file, by which another in its place is noticed; empty if there is none."""
     return (file.stat().st_size, file.stat().st_mtime_ns) if file.is_file() else ()
 
 

@@ -29,7 +29,7 @@ from touchr1_jax.training.kernel_probe import (
     standardise,
 )
 
-READINGS = ("standardised", "ranked")  # ways in which numbers of the two worlds are made comparable
+READINGS = ("standardised", "ranked")  # how numbers of the two worlds are made comparable
 
 GROUPS = {
     "all": ("levels", "material", "physics"),

@@ -101,7 +101,7 @@ GAINS: tuple[tuple[str, str, str, float], ...] = (
 """Where the text claims a gain of Touch-R1, in which column, over whom, how much."""
 
 OBJECTS, SENSORS, MOTIONS = 1_000, 4, 7
-"""Section 3.1, "Overview" and "Acquisition": at least so many objects; each is pressed and moved on in six ways."""
+"""Section 3.1, "Overview" and "Acquisition": at least so many objects; each is pressed, and moved with six motions."""
 
 SEQUENCES, RECORDS = 14_700, 1_323_000
 """Section 3.1, "Acquisition": what is left after filtering."""

@@ -216,7 +216,7 @@ def _check_window(presses: BallPresses, config: CalibrateConfig) -> None:
 
 
 def _check_colours(presses: BallPresses, config: CalibrateConfig) -> None:
-    """Under lamps of one colour all channels change alike, and a change tells no direction of a slope."""
+    """Under lamps of one colour all channels change alike, and a change does not show the direction of a slope."""
     change = presses.pictures[:, ::_STRIDE, ::_STRIDE].astype(np.float32) - presses.background[::_STRIDE, ::_STRIDE]
     change = change.reshape(-1, 3) - np.median(change, axis=(0, 1, 2))
     strong = change[np.abs(change).max(1) > _STRONG]

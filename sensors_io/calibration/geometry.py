@@ -5,8 +5,8 @@ A pin at pixel p lies at millimetre m on the gel,
     q = c + (p − c) a(λ r²) (1 + k r²),   a(z) = atan(√z) / √z,   r = |p − c| / R,      m = H q
 
 with centre c, half diagonal R and a homography H, which carries scale and tilt.  A single view of a flat board does not
-tell focal length from distance, and none is needed.  All are fitted to the pins by least squares in millimetres; the
-error that is reported is of pins left out of the fit.
+separate focal length from distance, and neither is needed.  All are fitted to the pins by least squares in
+millimetres; the error that is reported is of pins left out of the fit.
 
 The arc tangent is the field-of-view model of Devernay and Faugeras (Machine Vision and Applications 13, 14, 2001), for
 z < 0 its continuation atanh(√−z) / √−z.  On the two 9DTact boards, pins left out, it errs as little with two constants

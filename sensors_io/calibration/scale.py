@@ -6,7 +6,7 @@ radius a.  With the layer's compliance C and the pressure p of that circle,
     p(r) = Σ_k c_k (1 − r²/a²)^μ,   μ = k + ½,   p̂_k(q) = 2^μ Γ(μ + 1) a² J_{μ+1}(qa) / (qa)^{μ+1},
     ∫ C(q) p̂(q) J₀(qr) q dq = δ − R + √(R² − r²)   for r < a,
 
-which tells δ and the c_k by least squares.  A half-space gives a² ≈ Rδ, gel that does not sink in around the ball
+which gives δ and the c_k by least squares.  A half-space gives a² ≈ Rδ, gel that does not sink in around the ball
 a² ≈ 2Rδ: the gel's thickness decides between the two, and taking one for the other errs by 41 %.
 
 How far to trust it: pictures generated with the solved layer give a pitch 1.8 to 2.7 % too large, since the circles are

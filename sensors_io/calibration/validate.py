@@ -15,7 +15,7 @@ INNER = 0.7
 """Contact radii from the centre, within which a reconstruction is scored: safely on the ball."""
 
 LEAST_SHARE = 0.12
-"""Of that disc, which must lie in the picture: less of a ball does not tell its radius."""
+"""Of that disc, which must lie in the picture: its radius cannot be computed from less of a ball."""
 
 _STEPS, _SETTLED_MM = 30, 1e-7  # of the fit of a sphere
 

@@ -17,7 +17,7 @@ class Extraction:
     Args:
       background: that picture; `None` extracts nothing.
       calibration: of its colours; `None` leaves depth out.
-      mm_per_px: pitch, where neither calibration nor device tells it.
+      mm_per_px: pitch, where neither calibration nor device states it.
     """
 
     def __init__(self, background: pathlib.Path | None, calibration: pathlib.Path | None, mm_per_px: float):

@@ -23,7 +23,7 @@ class ForceZeroing(Bench):
     """Measure bias, mass and centre of mass of what sits on a force sensor, from static poses without contact.
 
     Turn the sensor slowly into different directions and hold each of them still until it is counted; end in the pose in
-    which you will record.  Nothing needs to be known of the poses: gravity tells their directions.
+    which you will record.  Nothing needs to be known of the poses: their directions follow from gravity.
     """
 
     out: pathlib.Path
@@ -69,7 +69,7 @@ def _take(sensor: Reader, finder: PoseFinder, wanted: int) -> np.ndarray | None:
     newest = None
     for sample in sensor.drain():
         if "force_n" not in sample.arrays:
-            raise ForceError(f"{sensor.identity.sensor} tells no force: give a force sensor, such as netft")
+            raise ForceError(f"{sensor.identity.sensor} measures no force: give a force sensor, such as netft")
         newest = sample.arrays["force_n"]
         moment = sample.arrays["moment_nmm"] if "moment_nmm" in sample.arrays else np.zeros(3)
         if len(finder.poses) < wanted:

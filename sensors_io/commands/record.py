@@ -218,7 +218,7 @@ def _warn_of_little_disk(out: pathlib.Path) -> None:
         )
 
 
-_MINI_MM_PER_PX = 0.0634  # of a GelSight Mini at 320 × 240, where no device tells its pitch
+_MINI_MM_PER_PX = 0.0634  # of a GelSight Mini at 320 × 240, where no device states its pitch
 
 
 class _Board:

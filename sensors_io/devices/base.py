@@ -22,7 +22,7 @@ class Identity:
 
     Args:
       sensor: canonical name in `schema.SENSORS`, or that of another kind of device, such as "netft".
-      serial: of this unit; empty where it tells none.
+      serial: of this unit; empty where it states none.
       product: what it calls itself.
       where: node, address or path it is reached by.
       settings: as read back after setting, JSON values; stored with every recording.
@@ -45,7 +45,7 @@ class Sample:
 
     Args:
       host_time_ns: monotonic, right after the grab.
-      device_time_ns: by the device's own clock; `None` where it tells none.
+      device_time_ns: by the device's own clock; `None` where it has none.
       index: by the device's own counter; `None` where it has none.
       frame: uint8 [H, W, 3] RGB, or uint16 [H, W] of a depth camera; `None` of a device without pictures.
       arrays: anything else, named as in `schema.FRAME_ARRAYS` without the leading N, such as `force_n` [3].

@@ -14,7 +14,7 @@ class CameraInfo:
       node: such as /dev/video0.
       product, serial: strings of the USB device; empty where it has none.
       usb_id: vendor and product number, such as "0c45:636d".
-      interface: number of the USB interface, which tells the cameras of one device apart; `None` where it has none.
+      interface: number of the USB interface, which distinguishes the cameras of one device; `None` where it has none.
     """
 
     node: str

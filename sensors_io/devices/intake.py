@@ -1,4 +1,4 @@
-"""Samples between a device and its consumer: a ring that counts whatever is lost, and the ways to read from it.
+"""Samples between a device and its consumer: a ring that counts whatever is lost, and the modes of reading from it.
 
     next(timeout)      the oldest sample that nobody has read: nothing is skipped unless the ring overflowed
     drain()            all unread samples at once

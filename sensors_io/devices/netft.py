@@ -2,7 +2,7 @@
 
 A command is `>HHI`: 0x1234, command, number of records to send (0 for ever).  A record is `>III6i`: number of the
 record, number of the internal sample, status, then Fx Fy Fz Tx Ty Tz in counts.  Counts per newton and per newton metre
-stand in the calibration, which the sensor tells over TCP: 20 bytes beginning with 1 are answered by `>HBBII6H`: 0x1234,
+stand in the calibration, which the sensor sends over TCP: 20 bytes beginning with 1 are answered by `>HBBII6H`: 0x1234,
 unit of force, unit of torque, counts per unit of force, counts per unit of torque, six scales of another protocol.
 (ATI document 9620-05-NET FT, sections 10 and 11; 9610-05-Ethernet Axia, sections 4.8 and 10.)
 """
@@ -135,7 +135,7 @@ class _RateCheck:
     No record is early: the least delay in each quarter of a second stays where it was if the rate is right, and drifts
     if it is not.  One step is none: a link that becomes late steps up, and later back to where it was; a machine that
     slept, whose clock stood still, steps down.  Two steps in one direction are a drift.  A record that was there before
-    the reader asked may be late by the reader's own delay, so that only its being early tells something.
+    the reader asked may be late by the reader's own delay, so that only an early one means something.
     """
 
     _EVERY_NS = NS_PER_S // 4
@@ -278,9 +278,10 @@ class NetFt:
         return found
 
     def _taken(self, last: "_Numbered", internal: int, stamp_ns: int) -> int | None:
-        """Records that the sensor took since the last one of the stream before; `None` if it lost power or cannot tell.
+        """Records that the sensor took since the last one of the stream before.
 
-        Internal samples count them at that stream's ratio, which is no whole number, over no longer than it lasted.
+        It is `None` if the sensor lost power between them or does not count.  Its internal samples count records
+        at that stream's ratio, which is no whole number, over no longer than it lasted.
         """
         assert self._first is not None
         span, gap = _signed(last.internal - self._first.internal), _signed(internal - last.internal)

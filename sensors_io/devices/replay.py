@@ -72,7 +72,7 @@ class Truth:
       produced: by the device.
       given: read at least once; `duplicated` of them twice.
       dropped: by chance; `away`: while disconnected.
-      unseen: of the dropped and away, those before the first given sample or after the last: no counter can tell them.
+      unseen: of the dropped and away, those before the first given sample or after the last: no counter shows them.
       disconnects: how often the device went away.
     """
 

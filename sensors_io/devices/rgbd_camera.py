@@ -21,7 +21,7 @@ class RgbdCameraConfig:
     Args:
       product, serial: of the USB device, as for a UVC camera.
       colour_interface, depth_interface: of its two cameras; 3 and 0 on a RealSense D435.
-      colour_index, depth_index: numbers of the video nodes, where the interfaces do not tell them apart.
+      colour_index, depth_index: numbers of the video nodes, where the interfaces do not distinguish them.
       replay: folder with colour/ and depth/ (16 bits), read instead of cameras.
       width, height: of both pictures, px.
       rate_hz: of both.

@@ -46,7 +46,7 @@ class Message:
 
     Args:
       index: the sensor's frame counter.
-      serial: the sensor's; its prefix tells the model.
+      serial: the sensor's; its prefix states the model.
       send_time_s: on the clock of the vendor's program, since its start.
       note: what the vendor's program has to say, mostly nothing.
       matrices: by the vendor's names, such as `3D_Displacements` [400, 3] mm; views of the datagrams' bytes.

@@ -69,7 +69,7 @@ def examine(grey: np.ndarray) -> Evidence:
     if min(grey.shape) < _TEXTURE_WINDOW_PX:
         raise SchemaError(
             f"the gel at rest is {grey.shape[0]} × {grey.shape[1]} px: must be ≥ {_TEXTURE_WINDOW_PX} px along either "
-            "side, to tell whether it carries a pattern; take a larger picture"
+            "side, to show whether it carries a pattern; take a larger picture"
         )
     texture, markers = texture_of(grey), find_markers(grey)
     missing = _missing(markers)

@@ -97,7 +97,7 @@ class Extractor:
         """The fields that this sensor cannot carry, and why, one sentence each."""
         reasons = []
         if self._depth is None:
-            reasons.append("depth_mm: without a calibration colours tell no slope; make one with `calibrate`")
+            reasons.append("depth_mm: without a calibration, colours do not show slopes; make one with `calibrate`")
         if self._deformation is None:
             reasons.append(f"deformation_mm, shear_mm: {self.evidence.reason}; use a gel with markers")
         elif self._shear is None:
@@ -154,7 +154,7 @@ class Extractor:
         return joined([self.read(frame, apart=True) for frame in frames])
 
     def _contacts(self, picture: np.ndarray) -> ContactRegions:
-        """Contacts by colour, where no depth tells them."""
+        """Contacts by colour, where there is no depth."""
         return changed_contacts(picture, self.background, self.mm_per_px, self.config.contact)
 
     def _flags(self, picture: np.ndarray, contacts: ContactRegions) -> Flag:

@@ -14,7 +14,7 @@ Nothing acts where nothing touches, and that is what the linear solution lacks: 
 
 What pressure makes along the surface of any even layer is a gradient, so with `gradient_free` u and C lose their
 gradients first (`helmholtz.shear_matrix`).  Depth then gives the pressure, the rest gives the traction: thickness and
-Poisson ratio, wrong by a third or by .03, then cost little; where they are known well, the whole motion tells more.
+Poisson ratio, wrong by a third or by .03, then cost little; where they are known well, the whole motion is better.
 
 Sources: Golub, Heath & Wahba, Technometrics 21, 215, 1979 (cross-validation); Wahba 1990, ch. 1 (penalty as covariance,
 Matérn's of order 3/2).  Departure from Tikhonov in wave numbers, which is the usual way: the window is finite here, and

@@ -1,7 +1,7 @@
 """Consistency of tracked points: a graph of near neighbours and the strain along its edges.
 
 A printed lattice looks the same one pitch further on.  A tracker that takes one dot for the next makes no error that
-the picture could tell, but it tears the gel: along the border of the mistaken points the strain is near one.
+the picture shows, but it tears the gel: along the border of the mistaken points the strain is near one.
 """
 
 import numpy as np

@@ -69,7 +69,7 @@ def _divergence(slope_x: np.ndarray, slope_y: np.ndarray) -> np.ndarray:
 
 @functools.lru_cache(maxsize=8)
 def _inverse_eigenvalues(shape: tuple[int, int], kind: str) -> np.ndarray:
-    """1 / λ_kl, and 0 for the mean, which slopes do not tell."""
+    """1 / λ_kl, and 0 for the mean, which slopes do not determine."""
     rows, columns = (2 * np.cos(np.pi * np.arange(n) / n) - 2 for n in shape)
     values = rows[:, None] + columns[None]
     values[0, 0] = np.inf

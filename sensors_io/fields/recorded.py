@@ -97,7 +97,7 @@ class RecordedGels:
         if calibration is None:
             if pitch is None:
                 raise CalibrationError(
-                    "nothing tells their mm per px: give --mm-per-px or --calibration, or import and record with it"
+                    "their mm per px are unknown: give --mm-per-px or --calibration, or import and record with it"
                 )
             if not 0 < pitch < 1:
                 raise CalibrationError(f"mm_per_px is {pitch}: must lie in (0, 1); give --mm-per-px or --calibration")

@@ -76,7 +76,7 @@ def read_pictures(inputs: Sequence[pathlib.Path], sensor: str, quality: QualityC
     Args:
       inputs: paths.
       sensor: whose frames are taken out of records.
-      quality: tells what is a gap between frames of records.
+      quality: defines what is a gap between frames of records.
 
     Raises:
       SourceError: a path without pictures, or pictures of different sizes.

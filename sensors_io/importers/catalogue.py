@@ -145,7 +145,7 @@ def import_catalogue(
 
 
 def _require_same_files(out: pathlib.Path, meta: RecordsMeta) -> None:
-    """Refuse to go on with a source that changed, in words that tell this from other options."""
+    """Refuse to continue with a source that changed; other options of the import have a message of their own."""
     if not (out / INDEX).is_file():
         return
     before, now = Index.read(out).meta.notes, json.loads(json.dumps(meta.notes))

@@ -1,4 +1,4 @@
-"""Boxes of an MP4 or QuickTime file (ISO/IEC 14496-12), which tell whether it is whole."""
+"""Boxes of an MP4 or QuickTime file (ISO/IEC 14496-12), which show whether it is whole."""
 
 import mmap
 import pathlib

@@ -6,7 +6,7 @@
 
 A clip is named by its path in FOLDER, with or without the ending of its file, and FOLDER itself by its own name.  All
 columns of the table but `clip` may be missing.  Without `object_id` every clip is an object of its own, named after its
-file.  Clips tell no force and no motion, which is "free".
+file.  Clips state no force and no motion, which is "free".
 """
 
 import dataclasses

@@ -128,7 +128,7 @@ def _sees_all(until_ns: int, entries: Seq[JournalEntry], frames: Seq[JournalEntr
 
 
 def _until_ns(span_ns: tuple[int, int], stream: Mapping[str, Any]) -> int:
-    """Last moment of a contact that a sensor could tell of: what is stamped late came when it was over."""
+    """Last moment of a contact that a sensor could show: what is stamped late came when it was over."""
     return span_ns[1] - max(0, round(stream["late_s"] * NS_PER_S))
 
 

@@ -46,7 +46,7 @@ class CoachConfig:
       hold_s: of the motion "hold".
       move_s: of a motion.
       taps: of the motion "tap".
-      overload_n: at which the hand is told to stop; half of what the sensors bear.
+      overload_n: at which the hand must stop; half of what the sensors bear.
     """
 
     touch_n: float = 0.1

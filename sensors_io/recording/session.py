@@ -1,9 +1,8 @@
 """A recording session: one object, its sites, one or more tactile sensors at once, one force sensor.
 
 Every contact goes into a journal of its own while it is recorded, and into the records when it is over: one sequence
-per sensor under one key, their times on one clock.  A session that was stopped or killed is gone on with by starting it
-again: journals that lie there are brought into the records first, the contacts that are complete are not asked for
-again.
+per sensor under one key, their times on one clock.  The same command continues a session that was stopped or
+killed: its journals are brought into the records first, and contacts that are complete are not asked for again.
 """
 
 import dataclasses
@@ -103,7 +102,7 @@ def record_session(
       out: directory of the records.
       config: what is recorded.
       tactile: open sensors of different names; the first one sits on the force sensor.
-      force: an open force sensor; `None` takes the force that a tactile sensor tells, or none in free motion.
+      force: an open force sensor; `None` takes the force that a tactile sensor measures, or none in free motion.
       show: called after every look at the devices.
       view: of the object, stored once with its card.
       stop: asked as often; True ends the session after bringing what was recorded into the records.
@@ -111,7 +110,7 @@ def record_session(
     Raises:
       RecordsError: the records are another data set's, of other sensors, mixed with others, or are being written.
       SchemaError: no sensor, two of one name, or one that no file can be named by.
-      ForceError: nothing tells the force that the protocol is led by.
+      ForceError: no device measures the force that leads the protocol.
       DeviceError: a device failed for good; what was recorded is in the records.
     """
     streams = tuple(Stream(i, feed, config.late_s.get(feed.identity.sensor, 0.0)) for i, feed in enumerate(tactile))
@@ -279,7 +278,7 @@ class _Session:
             self._rest_ns = (self._touched_ns + round(_RELAX_S * NS_PER_S), _NEVER_NS)
 
     def _forces(self, looked: Seq[list[Sample]], journal: JournalWriter) -> tuple[np.ndarray, np.ndarray]:
-        """Times [n] and forces [n, 3] on the gel: the force sensor's, else those that a tactile sensor tells."""
+        """Times [n] and forces [n, 3] on the gel: the force sensor's, else those of a tactile sensor."""
         if self._force is not None:
             measured = self._measured(self._force.drain(), journal)
             self._watch(measured[0], looked)
@@ -293,7 +292,7 @@ class _Session:
         if not self._config.free_s and all(stream.feed.counts.delivered for stream in self._streams):
             names = ", ".join(stream.sensor for stream in self._streams)
             raise ForceError(
-                f"{names} tells no force, which leads the protocol; add a force sensor, as in "
+                f"{names} measures no force, which leads the protocol; add a force sensor, as in "
                 "+ netft --host HOST, or record free motion, as with --free-s 10"
             )
         times = [stream.time_ns(samples) for stream, samples in zip(self._streams, looked, strict=True)]

@@ -11,7 +11,7 @@ from sensors_io.offsets import Offset, Offsets, OffsetsError
 from sensors_io.recording.streams import SampleReader
 from sensors_io.taps import Signal, TapError, tap_offset
 
-_STRIDE = 4  # of the pixels that tell how much a picture has changed
+_STRIDE = 4  # of the pixels from which the change of a picture is computed
 
 By = Literal["taps", "presses"]
 
@@ -66,17 +66,17 @@ class Listener:
         return Signal(time_ns=np.array(times, np.int64), value=np.array(values))
 
     def _telling(self, sample: Sample) -> tuple[str, np.ndarray]:
-        """Name and array of what tells a touch."""
+        """Name and array of what shows a touch."""
         if sample.frame is not None:
             return "frame", sample.frame[::_STRIDE, ::_STRIDE].astype(np.float32)
         for name in ("force_n", "deformation_mm", "depth_mm"):
             if name in sample.arrays:
                 return name, np.nan_to_num(np.asarray(sample.arrays[name], np.float64))
-        raise OffsetsError(f"{self.name} gives neither pictures nor forces nor fields: nothing tells a touch")
+        raise OffsetsError(f"{self.name} gives neither pictures nor forces nor fields: nothing shows a touch")
 
 
 _Kind = tuple[str, tuple[int, ...]]
-"""Name and shape of what tells a touch."""
+"""Name and shape of what shows a touch."""
 
 
 def _number(name: str, array: np.ndarray, first: np.ndarray) -> float:

@@ -15,7 +15,7 @@ from sensors_io.recording.journal import JournalWriter
 _BEFORE = 8  # frames kept from before a contact is armed: the gel untouched
 _LAMPS_LEVELS = 20.0  # that a channel of the gel at rest may change by; lamps that warm up change it by some percent
 _SETTLE_S = 0.3  # after a camera was opened: its first frames may be dark, or cut off
-_DRIFT_EVERY = 25  # untouched frames: drift is slow, and costs half a millisecond to tell
+_DRIFT_EVERY = 25  # untouched frames: drift is slow, and takes half a millisecond to measure
 
 
 class SampleReader(Protocol):
@@ -99,7 +99,7 @@ class Stream:
 
         Args:
           samples: of the last look.
-          rest_ns: since and until when it was, by the force; `None` where there is none and the pictures must tell.
+          rest_ns: since and until when it was, by the force; `None` where there is none and the pictures must show it.
         """
         times = self.time_ns(samples).tolist()
         if samples and self.feed.counts.disconnects != self._disconnects:

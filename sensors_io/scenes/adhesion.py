@@ -2,7 +2,7 @@
 
 The generator solves contacts without it.  It asks here for the least force at which that is within a tolerance and
 flags the frames of lighter touches; roughness, which keeps most surfaces from sticking, counts.  Leaving such frames
-out instead would tell the labels, since only smooth objects would lose theirs, and would tear every ramp open.
+out instead would reveal the labels, since only smooth objects would lose theirs, and would tear every ramp open.
 
 E* = E / (1 − ν²) is the plane-strain modulus, MPa; w the work of adhesion, N/mm (1 J/m² = 1e-3 N/mm).
 Sources: Johnson, Kendall & Roberts 1971; Derjaguin, Muller & Toporov 1975; Tabor 1977; Johnson & Greenwood 1997;

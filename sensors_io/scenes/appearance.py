@@ -1,7 +1,7 @@
 """The RGB-D view of an object: what it seems to be made of, drawn from the apparent material alone.
 
 Nothing in the picture depends on the true properties: colour, texture, gloss and relief follow the material that the
-object looks like.  An honest object looks like what it is, so the view tells as much as the material's odds do.
+object looks like.  An honest object looks like what it is, so the view shows as much as the odds of the material do.
 """
 
 import dataclasses

@@ -1,7 +1,7 @@
 """Choice of the grid, padding and tolerance that keep a contact below an error, from a first, coarse solution.
 
 Every scene is solved on 24² (`LOOK`), which takes a tenth of a millisecond.  What that solution and the gap on finer
-grids tell (`chooser_survey`) goes into a law of the error of every setting (`chooser_law`).  Where the coarse solution
+grids show (`chooser_survey`) goes into a law of the error of every setting (`chooser_law`).  Where the coarse solution
 is good enough it is the answer; else the cheapest setting that is goes on from it, so that little of the look is lost.
 No setting is a bed of springs alone: that is off by tens of per cent on every grid.
 """
@@ -82,7 +82,7 @@ class Solved:
 
 @struct.dataclass
 class CoarseSolve:
-    """One look: the coarse contact, what it tells, and what follows for the error asked for."""
+    """One look: the coarse contact, what it shows, and what follows for the error asked for."""
 
     contact: contact.Contact
     survey: Survey
@@ -228,7 +228,7 @@ def _look(
         spacing = window / LOOK.grid
         return contact.solve(gap, force, gel, body / modulus, spacing, LOOK.tolerance, thickness_mm=thickness)
 
-    def tell(found: contact.Contact, gaps: tuple[Array, Array, Array], modulus: Array) -> CoarseSolve:
+    def summary(found: contact.Contact, gaps: tuple[Array, Array, Array], modulus: Array) -> CoarseSolve:
         share = gel_share(gel, body / modulus)
         surveyed = survey(found.pressure_mpa, found.displacement_mm, gaps, share, window, thickness)
         index, promised, met = pick(error, log_error(surveyed, law, MENU), law)
@@ -236,7 +236,7 @@ def _look(
 
     gaps, force, modulus = given
     found = map_live(one, live, (gaps[0], force, modulus))
-    return jax.vmap(tell)(found, gaps, modulus)  # all at once: many small steps, none of which stops early
+    return jax.vmap(summary)(found, gaps, modulus)  # all at once: many small steps, none of which stops early
 
 
 @jax.jit

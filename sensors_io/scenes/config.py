@@ -30,10 +30,10 @@ class SceneConfig:
     what becomes of frames past the strain limit, where small-strain theory ends:
 
     - "replace", for whatever is asked about labels: they are left out and others stand for them, so that the force of
-      a frame tells no label (`schedule`).  Few presses reach 20 N, since gels are strained long before.
+      a frame reveals no label (`schedule`).  Few presses reach 20 N, since gels are strained long before.
     - "flag", for studies of the force itself, or of what lies past the theory: every press reaches 20 N, motions are
       dealt without regard to what objects bear, and frames past the limit carry `Flag.STRAIN_LIMIT`.  To reject these
-      afterwards, as `ClipConfig.rejected` does, is to let the force tell hardness and protrusion again.
+      afterwards, as `ClipConfig.rejected` does, lets the force reveal hardness and protrusion again.
 
     `frames` is by default 8 for presses and 90 for the protocol.  `split_shares` are the shares of objects in train,
     val and test.  The hand misses its targets by `force_jitter` (relative), the force sensor has a relative gain error

@@ -26,7 +26,7 @@ __all__ = ["MAX_ITERATIONS", "TOLERANCE", "Contact", "Known", "Tier", "convolve"
 MAX_ITERATIONS = 200
 TOLERANCE = 1e-3
 
-_COARSE_ITERATIONS = 30  # a coarse grid that needs more has nothing to tell the fine one
+_COARSE_ITERATIONS = 30  # a coarse grid that needs more does not help the fine one
 _COARSE_SLACK = 4.0  # a coarse solution differs from the fine one by more than this anyway
 
 

@@ -1,7 +1,7 @@
 """On which grid and to which tolerance one sequence is solved, so that its contacts stay below an error.
 
 `press.record` solves all frames of a sequence on one grid.  A few of them are solved on the chooser's coarsest grid,
-and what these tell of finer ones decides: the cheapest setting that promises enough for every one of them.
+and what these show about finer ones decides: the cheapest setting that promises enough for every one of them.
 """
 
 import dataclasses

@@ -1,7 +1,7 @@
 """Fit of the photometric optics to pictures of a rigid ball pressed into a real sensor.
 
 A press is three numbers, the *touch*: where the ball's axis meets the window and how wide the contact is.  Given the
-touches, the contact solver tells slopes and depth, and the optics follow by linear least squares; given the optics,
+touches, the contact solver gives slopes and depth, and the optics follow by linear least squares; given the optics,
 each touch follows by non-linear least squares on its own picture.  Both alternate, from touches that are given.
 
 Departures: the ball is rigid, the gel has the modelled thickness and, as in all scenes, small strain; tilt, friction

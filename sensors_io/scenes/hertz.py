@@ -51,7 +51,7 @@ class Hertz:
 
 
 def half_space_spectrum(points: int, spacing_mm: float, plane_modulus_mpa: float) -> np.ndarray:
-    """Spectrum of the free-space half-space kernel on a doubled grid: no periodic images are felt.
+    """Spectrum of the free-space half-space kernel on a doubled grid: periodic images have no effect.
 
     The kernel is the displacement by unit pressure on one rectangular pixel.
 

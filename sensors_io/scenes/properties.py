@@ -3,7 +3,7 @@
 A property is a monotone function of a normal latent x = m(material) + σ ε, so the ranges of all materials overlap and
 the material only shifts the odds.  Levels come from the physical value alone, by the thresholds below.  No hardness,
 roughness or protrusion lies within 18 % of a threshold, where two annotators would disagree; next to that gap objects
-are hard to tell apart still.  Friction and elasticity, which no hand tells by level, have no gap at all.
+are still hard to distinguish.  Friction and elasticity, which no hand sorts into levels, have no gap at all.
 """
 
 import bisect

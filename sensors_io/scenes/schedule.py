@@ -4,7 +4,7 @@ The protocol.  Every object is pressed once, all other contacts are the six expl
 and 10 N; all sensors see every contact; contacts come in a random order, so that every prefix is a fair sample.
 
 Frames past the strain limit are left out and replaced, if `SceneConfig.past_limit` says so.  Leaving them out alone
-would tell the labels: a ramp that ends at 7 N is that of a hard, protruding object, one that reaches 20 N that of a
+would reveal the labels: a ramp that ends at 7 N is that of a hard, protruding object, one that reaches 20 N that of a
 soft one.  What is done instead:
 
 - Only shape decides what a contact must bear, by its rigid limit (`strength`), so hardness does not.
@@ -16,7 +16,7 @@ soft one.  What is done instead:
   object's limit, and has the same distribution in every cell.  Its frames past C are replaced by a finer ramp below.
 - A motion that its object cannot bear is replaced by the same motion at the same force on another object of the cell.
 
-The force then tells none of the three ordinal levels; the price is that few presses reach 20 N.
+The force then reveals none of the three ordinal levels; the price is that few presses reach 20 N.
 
 Where frames past the limit are flagged instead, every object counts as one that bears any force: all presses reach 20 N
 and motions are dealt without regard to what objects bear.

@@ -2,7 +2,7 @@
 
 The look solves five forces on a coarse grid for every sensor.  Strain grows nearly as a power of force, so the limit
 lies on the log–log line between two of them.  Every object is looked at twice: as it is, and as if it were rigid.  The
-rigid limit is the lower one and depends on shape alone, so choosing forces by it tells nothing about hardness.
+rigid limit is the lower one and depends on shape alone, so choosing forces by it reveals nothing about hardness.
 """
 
 import dataclasses

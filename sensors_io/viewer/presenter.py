@@ -21,7 +21,7 @@ from sensors_io.schema import Flag
 from sensors_io.viewer.panels import SCALES, Panel, panels
 from sensors_io.viewer.server import LiveView, Numbers
 
-_OVERLOAD_N = 22.0  # at which the hand is told to stop; half of what the sensors bear
+_OVERLOAD_N = 22.0  # at which the hand must stop; half of what the sensors bear
 _RATE_S = 1.0  # over which rates are measured
 _STALE_S = 1.0  # an older sample is not shown as if it were new
 _FRAME_S = 1 / 30  # between two published states: screens show no more
@@ -44,7 +44,7 @@ class Channel:
 
     Args:
       device: open; its ring is left alone.
-      extractor: of the fields of its pictures; `None` shows what the sensor tells itself.
+      extractor: of the fields of its pictures; `None` shows the fields of the sensor itself.
     """
 
     def __init__(self, device: Watched, extractor: Extractor | None = None):
@@ -111,7 +111,7 @@ class Channel:
         return listed
 
     def _with_fields(self, sample: Sample) -> Sample:
-        """The sample with the fields of its picture among its arrays, those that the sensor tells itself left alone."""
+        """The sample with the fields of its picture among its arrays, without changing those of the sensor itself."""
         frame = sample.frame
         self.flags = Flag(int(sample.arrays["flags"])) if "flags" in sample.arrays else Flag.NONE
         if frame is None or frame.ndim != 3:
@@ -136,7 +136,7 @@ class Presenter:
 
     Args:
       channels: the sensors.
-      force: the force sensor; without one the first force that a sensor tells is shown.
+      force: the force sensor; without one the first force that a sensor measures is shown.
       live: where to.
       words: prompt and alarm of a session under way.
     """
@@ -170,7 +170,7 @@ class Presenter:
         return True
 
     def run(self, stop: Callable[[], bool]) -> None:
-        """Publish, at most 30 times a second, until told to stop or until a device ends."""
+        """Publish, at most 30 times a second, until it is stopped or until a device ends."""
         while not stop():
             began_s = time.monotonic()
             try:

@@ -49,7 +49,7 @@ def one_batch(data: Dataset) -> TouchBatch:
 
 
 def params(policy: TouchPolicy, data: Dataset, *, loud: float = 0.4, seed: int = 0) -> Params:
-    """Loud parameters, so that answers depend on what is asked and felt."""
+    """Loud parameters, so that answers depend on the question and on touch."""
     return draw_params(jax.eval_shape(lambda batch: policy.init(0, batch), one_batch(data)), seed, loud=loud)
 
 

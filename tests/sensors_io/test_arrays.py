@@ -42,9 +42,9 @@ def test_what_is_no_array_is_refused(tmp_path, data, message):
 
 def test_a_refusal_is_one_line_and_does_not_say_how_to_trust_the_file(tmp_path):
     (tmp_path / "a.npy").write_bytes(npy(" " * 60_000))
-    with pytest.raises(ArraysError, match="Header info length") as told:
+    with pytest.raises(ArraysError, match="Header info length") as raised:
         load_arrays(tmp_path / "a.npy")
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(raised.value)
 
 
 def test_two_arrays_of_one_name_are_refused(tmp_path):

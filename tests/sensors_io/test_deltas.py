@@ -1,4 +1,4 @@
-"""Differences of frames: exact both ways, by hand, and chosen as the frames want them."""
+"""Differences of frames: exact in both directions, by hand, and chosen as the frames want them."""
 
 import hypothesis
 import numpy as np

@@ -84,7 +84,7 @@ for line in sys.stdin:
         os._exit(0)
     print(os.waitpid(child, 0)[1], flush=True)
 """
-"""Generates in one fork after the other, each killed at a place that it is told."""
+"""Generates in one fork after the other, each killed at a given place."""
 
 
 @pytest.fixture

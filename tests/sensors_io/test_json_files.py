@@ -18,14 +18,14 @@ from touchr1_jax.bench import json_lines
 def test_two_processes_that_write_one_file_leave_that_of_the_later(tmp_path, monkeypatch, write, first, second):
     path, pid, sync = tmp_path / "x.json", os.getpid(), os.fsync
 
-    def beside(descriptor):
+    def meanwhile(descriptor):
         sync(descriptor)
         if os.getpid() == pid:
             with monkeypatch.context() as other:
                 other.setattr(os, "getpid", lambda: pid + 1)
                 write(path, second)
 
-    monkeypatch.setattr(os, "fsync", beside)
+    monkeypatch.setattr(os, "fsync", meanwhile)
     write(path, first)
     monkeypatch.undo()
     content = path.read_bytes()

@@ -264,7 +264,7 @@ def test_an_interrupt_says_how_to_go_on(run, tmp_path, monkeypatch, capsys):
 
 
 def test_check_looks_at_pictures_where_it_can(run, tmp_path):
-    """Real presses of a Mini beside their gel at rest; the other sensors' noise has no background and says so."""
+    """Real presses of a Mini and their gel at rest; the other sensors' noise has no background and says so."""
     names = ("background", "press_12", "press_14", "press_18")
     frames = np.stack([read_picture(GELSLAM / f"{name}.png") for name in names])
     fakes.write(tmp_path, 1, sensors=("tac3d",))
@@ -282,13 +282,13 @@ def test_check_looks_at_pictures_where_it_can(run, tmp_path):
     assert "not looked at: 1 sequences, no gel at rest was recorded" in out
 
 
-def test_progress_without_a_terminal_is_told_in_lines(monkeypatch):
-    """The first contact was there before; what came within ten seconds of the last line, or ends it, is not told."""
-    told = io.StringIO()
-    monkeypatch.setattr(printing, "ERR", Console(file=told, width=200))
+def test_progress_without_a_terminal_is_written_in_lines(monkeypatch):
+    """The first contact was there before; what came within ten seconds of the last line, or ends it, is not written."""
+    written = io.StringIO()
+    monkeypatch.setattr(printing, "ERR", Console(file=written, width=200))
     clock = iter([0.0, 5.0, 10.0, 12.0, 20.0])
     monkeypatch.setattr(printing, "time", types.SimpleNamespace(monotonic=lambda: next(clock)))
     with printing.progress_bar("contacts") as progress:
         for done in (2, 3, 4, 5):
             progress(done, 5)
-    assert told.getvalue() == "contacts: 3/5, 0.2/s, 10 s left\n"
+    assert written.getvalue() == "contacts: 3/5, 0.2/s, 10 s left\n"

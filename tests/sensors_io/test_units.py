@@ -89,7 +89,7 @@ def test_every_unit_is_run_once_and_none_that_is_done(folder):
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore")
 def test_a_worker_that_dies_costs_its_unit_one_more_run_and_a_unit_that_fails_no_other(launcher, folder):
-    """None that is done is run.  submitit goes on after SIGTERM, which Slurm sends beside the signal it waits for."""
+    """None that is done is run.  submitit goes on after SIGTERM, which Slurm sends with the signal it waits for."""
     (folder / "u2").write_text("made before")
     said, ended, goes_on = [], [], launcher.engine == "slurm"
     work = listed(folder, u1="SIGKILL", u3="raise", u4="SIGTERM")

@@ -52,7 +52,7 @@ _BALANCED = "balanced {} accuracy: mean over the levels of the accuracy on each"
 METRICS: Mapping[str, Metric] = {
     "acc": share_metric("Acc", "mean of H-, R- and P-Acc"),
     **{f"{PREFIX[a]}_acc": share_metric(f"{PREFIX[a].upper()}-Acc", _RIGHT.format(a)) for a in ORDINAL},
-    "mat_acc": share_metric("Mat-Acc", "material answers that are right, nine ways; unparsable is wrong"),
+    "mat_acc": share_metric("Mat-Acc", "material answers that are right, of nine; unparsable is wrong"),
     **{
         f"{PREFIX[a]}_bacc": share_metric(f"{PREFIX[a].upper()}-bAcc", _BALANCED.format(a), secondary=True)
         for a in ORDINAL

@@ -1,6 +1,6 @@
 """Sharding of every parameter, of optimizer state, caches and batches on a mesh.
 
-A parameter is placed by the last two names of its path, layer and leaf, since a layer's name tells its role; one that
+A parameter is placed by the last two names of its path, layer and leaf, since a layer's name states its role; one that
 stacks layers is split as each of them is.  Moments
 of an optimizer, averaged and reference parameters are nested as the parameters are and end in the same two names, so
 that one table serves all of them.

@@ -1,7 +1,7 @@
 """Predictor of tactile dynamics: from the latents of some streams up to now to the latents of all streams next.
 
 Every (stream, step) is one token of a small causal transformer.  The token of (s, t) holds the latent of that step
-where the stream is shown, tells when and how hard the next touch will be, and is turned into the latent of (s, t + 1).
+where the stream is shown, says when and how hard the next touch will be, and is turned into the latent of (s, t + 1).
 """
 
 import dataclasses
@@ -16,7 +16,7 @@ from touchr1_jax.models.layers import MASKED, RMSNorm
 from touchr1_jax.models.tactile_vit import earlier_steps, force_features, sinusoid
 
 TIME_WAVES = 32
-"""Numbers that tell a frame index apart, as in the encoder."""
+"""Numbers that encode a frame index, as in the encoder."""
 
 LN_FLOOR = 1e-6
 """Added to the variance of a latent under the root of its layer norm."""

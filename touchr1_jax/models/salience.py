@@ -17,7 +17,7 @@ from touchr1_jax import masked
 from touchr1_jax.types import TouchBatch
 
 STRIDE_PX = 4
-"""A contact is many times wider than this; all pixels would tell the same at sixteen times the cost."""
+"""A contact is many times wider than this; all pixels would show the same at sixteen times the cost."""
 
 FEW_FRAMES = 12
 """Up to this many frames all choices can be compared: 12 over 6 are 924."""

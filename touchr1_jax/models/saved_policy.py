@@ -131,7 +131,7 @@ def published(folder: Path, parts: Collection[str] = ()) -> Iterator[Path]:
     """A new folder that takes the place of `folder` if the block ends without an error, and else vanishes.
 
     A killed process leaves the old one or the new one; where the file system cannot exchange two folders, the old one
-    may be in the same folder under a hidden name, which `read_sealed` tells.  A link is followed.
+    may be in the same folder under a hidden name, which `read_sealed` reports.  A link is followed.
 
     Args:
       folder: where; only `parts` of what is there, by their names, may be replaced.

@@ -65,7 +65,7 @@ class AnswerProgram:
 
 HONEST = AnswerProgram("in order", (TOUCH,) * SENSORS, TOUCH, TOUCH)
 ECHO = AnswerProgram("in order", (COPY,) * SENSORS, TOUCH, TOUCH)
-"""The honest conclusion copied into all slots: who knows the label alone cannot tell it from sensors that agree."""
+"""The honest conclusion copied into all slots: the label alone does not distinguish it from sensors that agree."""
 
 
 def programs() -> list[AnswerProgram]:

@@ -103,7 +103,7 @@ class WeightedScore:
           ValueError: a parser without segments.
         """
         if not isinstance(self.parser, Parser):
-            raise ValueError(f"parser is {self.parser!r}: must be a text.parser.Parser to tell segments; use one")
+            raise ValueError(f"parser is {self.parser!r}: must be a text.parser.Parser to find segments; use one")
         settled = {n: SEGMENTS.index(r.settled) for n, r in self.rewards.items() if isinstance(r, Reward)}
         segment = jax.vmap(jax.vmap(self.parser.segments))(tokens)
         return segment_advantages(algorithm, reward, terms, settled, segment, finite)

@@ -29,7 +29,7 @@ class Attribute:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Sensor:
-    """A tactile sensor: `phrases` are the ways to name it, the first one canonical."""
+    """A tactile sensor: `phrases` are its names, the first one canonical."""
 
     name: str
     phrases: tuple[str, ...]

@@ -22,7 +22,7 @@ MOST_BYTES = 4 * 2**30
 """Size of the cache; what was not used for longest goes.  Only with a bound does JAX lock the entries it writes."""
 
 OLDER_LOOPS = "--xla_cpu_use_fusion_emitters=false" if jax.__version_info__ < (0, 11) else ""
-"""Flag of XLA: the older of its two ways to write a fused loop, as long as it exists, compiles twice as fast."""
+"""Flag of XLA: the older of its two code generators for a fused loop, as long as it exists, compiles twice as fast."""
 
 FLAGS = "XLA_FLAGS"
 """Environment variable that XLA reads when it compiles its first program, and never again."""

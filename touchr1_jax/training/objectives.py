@@ -13,8 +13,8 @@ from touchr1_jax import masked
 from touchr1_jax.models.tactile_vit import force_features
 
 Objective = Literal["dynamics", "contrast", "masked", "physics"]
-"""Predict the next latent; tell the contact that two sensors share from others; predict the latents of hidden patches;
-estimate force and depth."""
+"""Predict the next latent; find the contact that another sensor shares among others; predict the latents of hidden
+patches; estimate force and depth."""
 
 TEMPERATURE = 0.1
 """Cosines of embeddings are divided by it."""

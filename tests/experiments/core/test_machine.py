@@ -235,6 +235,6 @@ def test_a_mesh_of_more_devices_than_there_are_is_one_line(tmp_path, capsys):
     folders = ["--runs-dir", str(tmp_path / "runs"), "--cache-dir", str(tmp_path / "cache")]
     many = jax.device_count() + 1
     code = main(["small_study", "--scale", "short", "--mesh.data", str(many), *folders], package=PACKAGE)
-    told = capsys.readouterr()
+    captured = capsys.readouterr()
     assert code == 1
-    assert f"MachineError: mesh data · fsdp · tensor is {many} · 1 · 1" in told.out + told.err
+    assert f"MachineError: mesh data · fsdp · tensor is {many} · 1 · 1" in captured.out + captured.err

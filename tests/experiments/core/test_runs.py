@@ -191,7 +191,7 @@ def test_a_file_in_a_part_of_a_run_names_the_run_and_the_part(tmp_path):
     one, other = (make_run(tmp_path / n, "20260101-000000") for n in "ab")
     write_json(other / "config.json", runs.read_description(other) | {"config": {"steps": 8}})
     assert len({runs.labelled(run / part, "answers/sft-0") for run in (one, other) for part in ("", "x", "y")}) == 6
-    (tmp_path / "b" / "config.json").write_text('{"model_type": "qwen2_5_vl"}')  # beside the weights of a model
+    (tmp_path / "b" / "config.json").write_text('{"model_type": "qwen2_5_vl"}')  # in the folder of a model's weights
     assert runs.labelled(tmp_path / "a" / "x", "sft/0") == runs.labelled(tmp_path / "b" / "x", "sft/0")  # of no run
 
 

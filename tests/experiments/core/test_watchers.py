@@ -25,7 +25,7 @@ RELOAD = 'http-equiv="refresh"'
 
 
 class Clock:
-    """Seconds that pass only when told to."""
+    """A clock that only the test advances."""
 
     now = 100.0
 

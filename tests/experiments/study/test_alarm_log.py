@@ -18,7 +18,7 @@ from touchr1_jax.training.loop import SKIPPED
 STAGE, STEPS = "grpo/chosen/0", WINDOW + 6
 
 
-def told(directory: Path, metrics: dict[str, float]) -> str:
+def printed_after(directory: Path, metrics: dict[str, float]) -> str:
     """What a stage prints after one step."""
     console = Console(file=io.StringIO(), width=300)
     context = Context(directory, directory / "cache", console)
@@ -28,14 +28,14 @@ def told(directory: Path, metrics: dict[str, float]) -> str:
 
 
 def test_a_step_that_lost_its_update_raises_the_alarms_of_its_other_numbers(tmp_path):
-    said = told(tmp_path, {SKIPPED: 1.0, "touch_share": 0.0})
+    said = printed_after(tmp_path, {SKIPPED: 1.0, "touch_share": 0.0})
     assert "F10" in said
     assert "update is left out" in said
 
 
 def test_a_reward_that_is_rarely_not_finite_is_not_said_to_be_always_finite(tmp_path):
     for share, shown in ((1 / 512, "0.195 %"), (1.0, "100 %")):
-        assert f"{shown} of the groups" in told(tmp_path, {f"{NONFINITE_IN}spread": share})
+        assert f"{shown} of the groups" in printed_after(tmp_path, {f"{NONFINITE_IN}spread": share})
 
 
 @pytest.mark.parametrize("stopped_at", [0, 3, WINDOW + 2, STEPS])
@@ -52,4 +52,4 @@ def test_a_resumed_stage_logs_the_alarms_of_an_uninterrupted_one(tmp_path, stopp
         said.append(console.file.getvalue().count("A1"))
     raised = [line["step"] for line in read_metrics(tmp_path) if f"{ALARM}A1" in line]
     assert raised == list(range(WINDOW - 1, STEPS))
-    assert sum(said) == 1  # told once, also over an interruption
+    assert sum(said) == 1  # printed once, also over an interruption

@@ -51,9 +51,9 @@ def test_a_perfect_answer_earns_the_sum_of_the_weights_and_silence_the_penalty(p
         length=np.zeros(n, np.int32),
     )
     silent = jax.tree.map(lambda x: x & False if x.dtype == bool else x * 0 - 1, perfect)
-    felt = dataclasses.replace(said, streams=np.ones((n, 4), bool), parsed=perfect)
-    np.testing.assert_allclose(rewards_of(policy, felt, weights, data.prior()), 1.0, atol=1e-6)
-    mute = reward_terms(policy, dataclasses.replace(felt, parsed=silent), weights, data.prior())
+    touched = dataclasses.replace(said, streams=np.ones((n, 4), bool), parsed=perfect)
+    np.testing.assert_allclose(rewards_of(policy, touched, weights, data.prior()), 1.0, atol=1e-6)
+    mute = reward_terms(policy, dataclasses.replace(touched, parsed=silent), weights, data.prior())
     material = said.attribute == 3  # consistency does not apply: the other weights grow from 0.7 to 1
     np.testing.assert_allclose(mute["exact"], np.where(material, -0.06 / 0.7, -0.06), atol=1e-6)
 

@@ -188,8 +188,8 @@ def test_rows_hold_the_examples_of_the_batch_and_nothing_else_changes(policy, an
     tokens = np.concatenate([packed.ids, packed.tokens], -1).reshape(-1)
     said = [tokens[row[at[at >= 0] + 1]] for row, at in rows_of(packed.rows)]
     assert sorted(np.concatenate(said)) == sorted(packed.tokens[packed.token_mask])
-    felt = np.concatenate([row for row, _ in rows_of(packed.rows)])
-    touch = np.isin(felt % n, policy.layout.touch.ravel())
+    sensed = np.concatenate([row for row, _ in rows_of(packed.rows)])
+    touch = np.isin(sensed % n, policy.layout.touch.ravel())
     steps = packed.streams[..., None] & packed.touch.frame_mask[:, None]  # a step is a frame here
     assert touch.sum() == steps.sum() * policy.model.tactile.tokens_per_step
 
@@ -313,15 +313,15 @@ def test_all_streams_are_felt_as_often_as_is_asked(full_share):
 
 
 def test_a_curriculum_begins_with_all_sensors(answers, data):
-    """Of batch after batch, as many questions are felt by all sensors as `falling_share` says; then as without it."""
+    """Of batch after batch, as many questions have touch of all sensors as `falling_share` says; then as without it."""
     assert [falling_share(step, 4) for step in range(6)] == [1, 0.875, 0.75, 0.625, 0.5, 0.5]
     assert falling_share(0, 0) == falling_share(100, 0) == 0.5
     feed, plain = answers(easy_steps=3), answers()
-    felt = [(np.asarray(next(feed).streams), np.asarray(next(plain).streams)) for _ in range(5)]
-    assert felt[0][0].all()
-    assert (felt[0][0] != felt[0][1]).any()
-    assert all((mine >= other).all() for mine, other in felt)
-    assert all((mine == other).all() for mine, other in felt[3:])
+    sensed = [(np.asarray(next(feed).streams), np.asarray(next(plain).streams)) for _ in range(5)]
+    assert sensed[0][0].all()
+    assert (sensed[0][0] != sensed[0][1]).any()
+    assert all((mine >= other).all() for mine, other in sensed)
+    assert all((mine == other).all() for mine, other in sensed[3:])
 
 
 def test_blocks_have_one_size_and_tell_how_many_rows_are_real():
@@ -338,7 +338,7 @@ def test_a_contact_is_not_asked_more_questions_than_there_are(answers):
 
 
 def test_the_order_of_questions_is_not_made_ahead(questions):
-    """Grain's threads would shuffle 500 batches beside the training that they are for."""
+    """Grain's threads would shuffle 500 batches while the training that they are for runs."""
     before = set(threading.enumerate())
     feed = questions()
     next(feed)

@@ -85,7 +85,7 @@ def test_adapters_on_rows_are_trained_beside_a_decoder_that_stands_still(policy,
 
 
 def test_a_curriculum_is_a_share_of_the_steps(policy, data, evidence):
-    """Of all of them the first batch is felt by all sensors, which it would not be without."""
+    """Of all of them the first batch has touch of all sensors, which it would not have without."""
     config = StudySFT(steps=3, batch_size=4)
     plain, easy = (
         next(answer_feed(policy, data, evidence, dataclasses.replace(config, curriculum=share), seed=0)).streams
@@ -99,7 +99,7 @@ def test_a_curriculum_is_a_share_of_the_steps(policy, data, evidence):
 def test_the_decoders_phase_trains_the_decoder_alone_and_returns_its_best_point(
     policy, data, params, evidence, tmp_path
 ):
-    """The second of three points is the best; adapters are scored beside the decoder's weights."""
+    """The second of three points is the best; adapters are scored together with the decoder's weights."""
     rows = data.parts["sft"]
     config = dataclasses.replace(tiny.STUDY.decoder, steps=3, save_every=1)
     order, scores, scored = {"batch_size": config.batch_size, "seed": 0}, iter([1.0, 3.0, 2.0]), []

@@ -43,7 +43,7 @@ TEST = np.array([[0, 1, 2, 8], [2, 1, 0, 0], [1, -1, 1, 4], [1, 0, 0, 8], [1, 2,
 
 
 def answers_about(label: np.ndarray, alone: bool = True) -> Evaluation:
-    """Random answers to every labelled question, felt by all four sensors but the last contact's by two."""
+    """Random answers to every labelled question, with touch of all four sensors, for the last contact of two."""
     rng = np.random.default_rng(0)
     contact, attribute = np.nonzero(label >= 0)
     n, asked = len(contact), np.arange(4) == attribute[:, None]
@@ -110,8 +110,8 @@ def test_answers_survive_the_disk(tmp_path, alone):
 def test_answers_of_another_policy_seed_or_run_are_not_taken(tmp_path, name):
     git = {"commit": "", "dirty": False}
     for run, experiment, steps in (("run", "a", 9), ("other", "a", 8), ("twin", "b", 9)):
-        told = {"experiment": experiment, "config": {"steps": steps}, "git": git}
-        write_json(tmp_path / run / "config.json", dict.fromkeys(FIELDS, "") | told)
+        description = {"experiment": experiment, "config": {"steps": steps}, "git": git}
+        write_json(tmp_path / run / "config.json", dict.fromkeys(FIELDS, "") | description)
     mine = tmp_path / "run" / "answers" / "sft-0.npz"
     save_answers(mine, answers_about(TEST))
     (tmp_path / name).parent.mkdir(exist_ok=True)

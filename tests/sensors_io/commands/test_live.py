@@ -135,7 +135,7 @@ def test_force_zero_from_static_poses(tmp_path, poses, capsys):
 
 @pytest.mark.long
 def test_sync_and_its_check(tmp_path, capsys):
-    """A film and a force recording of the same taps; the film is replayed beside it, so that little is left over."""
+    """A film and a force recording of the same taps; the film is replayed with it, so that little is left over."""
     at = np.cumsum([0.3, 0.45, 0.35, 0.5])
     time_s = np.arange(0, 1.9, 0.005)
     past = time_s[:, None] - at
@@ -155,7 +155,7 @@ def test_sync_and_its_check(tmp_path, capsys):
 
 
 def test_view_extracts_fields_of_a_camera(tmp_path, capsys):
-    """Presses of a real Mini without calibration: no depth and no shear can be told, and the view says so."""
+    """Presses of a real Mini without calibration: no depth and no shear can be computed, and the view says so."""
     gelslam = ROOT / "tests" / "data" / "gelslam"
     args = ["view", "--port", "0", "--seconds", "0.3", "--background", gelslam / "background.png", "replay"]
     assert cli.main([*map(str, args), "--path", str(gelslam), "--seconds", "30"]) == 0
@@ -218,7 +218,7 @@ def test_a_pin_board_gives_a_geometry(tmp_path):
 
 
 def test_two_sensors_are_recorded_into_one_contact(tmp_path, press, capsys):
-    """Each at its own rate, one offset taken off, with a page beside the recording; once more, nothing is missing."""
+    """Each at its own rate, one offset taken off, with a page of the recording; once more, nothing is missing."""
     out, sync = tmp_path / "records", tmp_path / "s.json"
     late = Offset(late_s=0.1, spread_s=0.001, events=5, by="taps")
     Offsets(reference="tac3d", sensors={"gelsight_mini": late}).save(sync)

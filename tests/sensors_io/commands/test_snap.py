@@ -129,9 +129,9 @@ def test_a_broken_sample_is_counted_and_ends_no_session(tmp_path, presses, capsy
     monkeypatch.setattr(Replay, "read", flaky)
     words = ["--out", str(tmp_path / "out"), "--ball-diameter-mm", "4", "--mm-per-px", "0.1", "--port", "0"]
     assert main(["snap", *words, "replay", "--path", str(tmp_path / "shots")]) == 1
-    told = capsys.readouterr()
-    assert "1 broken samples were left out" in told.out
-    assert "has been replayed to its end" in told.err
+    captured = capsys.readouterr()
+    assert "1 broken samples were left out" in captured.out
+    assert "has been replayed to its end" in captured.err
 
 
 def test_two_sessions_do_not_take_their_pictures_into_one_folder(tmp_path, presses, capsys):

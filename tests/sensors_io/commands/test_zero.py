@@ -1,4 +1,4 @@
-"""`zero`: the sensor is told, its force before and after is shown, and one that cannot is named."""
+"""`zero`: the sensor is asked to, its force before and after is shown, and one that cannot is named."""
 
 import contextlib
 import time

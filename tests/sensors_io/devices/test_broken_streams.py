@@ -144,9 +144,9 @@ def test_a_slow_clock_is_named_once(rate):
     numbers = [*range(100), 101, 100, *range(102, 200)]
     stamped = [(n, round(33 * n * rate * 1e6)) for n in numbers]
     samples = [sample(n, time_ms=33 * k, device_time_ns=ns) for k, (n, ns) in enumerate(stamped)]
-    with pytest.warns(WrongRateWarning, match="fall behind") as told:
+    with pytest.warns(WrongRateWarning, match="fall behind") as warned:
         [intake.offer(one) for one in samples]
-    assert len(told) == 1
+    assert len(warned) == 1
 
 
 @pytest.mark.parametrize("hz", [40, 50, 100])
@@ -155,9 +155,9 @@ def test_a_device_that_sends_faster_than_it_is_said_to_loses_no_less_than_nothin
     intake = Intake(capacity=999, clock=JumpingClock())
     intake.opened(Identity(sensor="digit", period_s=1 / 32))
     times = [1000 * k // hz for k in range(10 * hz)]
-    with pytest.warns(WrongRateWarning, match="digit sends faster than the 32 Hz that it states") as told:
+    with pytest.warns(WrongRateWarning, match="digit sends faster than the 32 Hz that it states") as warned:
         collections.deque((intake.offer(sample(time_ms=ms)) for ms in times), maxlen=0)
-    assert (len(told), intake.counts.missing) == (1, 0)
+    assert (len(warned), intake.counts.missing) == (1, 0)
     for ms in times:
         intake.offer(sample(time_ms=40_000 + ms))  # after half a minute
     assert 29 * 32 <= intake.counts.missing <= 31 * 32

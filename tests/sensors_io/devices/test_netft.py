@@ -65,7 +65,7 @@ def test_counts_become_newtons_and_newton_millimetres():
 
 
 @pytest.mark.parametrize(
-    ("told", "then", "number"),
+    ("earlier", "then", "number"),
     [
         ([(1, 70), (101, 770)], (1, 1470), 201),  # each stream begins at 1, a hundred records after the first ended
         ([(1, 0), (200, 97), (201, 98)], (1, 147), 301),  # 488 internal samples in a second
@@ -80,10 +80,10 @@ def test_counts_become_newtons_and_newton_millimetres():
         ([(1, 70)], (1, 777), None),  # how many a record has is not known
     ],
 )
-def test_a_number_goes_on_when_the_sensor_is_opened_again(told, then, number):
+def test_a_number_goes_on_when_the_sensor_is_opened_again(earlier, then, number):
     """By its internal samples: a late link is opened again too, and its records are no later than before."""
-    with sensor([record(k, *[0] * 6, internal=n) for k, n in told]) as (config, _), config.open() as device:
-        *_, last = [device.read(5.0) for _ in told]
+    with sensor([record(k, *[0] * 6, internal=n) for k, n in earlier]) as (config, _), config.open() as device:
+        *_, last = [device.read(5.0) for _ in earlier]
         rate = device._rate
     with sensor([record(then[0], *[0] * 6, internal=then[1])]) as (device._config, _), device:
         found = device.read(5.0)

@@ -1,4 +1,4 @@
-"""Three ways to read, and books that balance."""
+"""Three modes of reading, and counts that add up."""
 
 import contextlib
 import threading

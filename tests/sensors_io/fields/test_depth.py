@@ -103,7 +103,7 @@ def test_hysteresis_keeps_no_shallow_region_and_no_speck() -> None:
 
 
 def test_a_zero_level_that_drifts_is_no_contact() -> None:
-    """A corner that rises by 0.1 mm over 10 mm beside a bump of 0.5 mm: one contact, away from the border."""
+    """A corner that rises by 0.1 mm over 10 mm next to a bump of 0.5 mm: one contact, away from the border."""
     y, x = np.mgrid[:160, :214] * 0.1
     drift = (0.1 * np.clip((x + y - 27) / 10, 0, 1)).astype(np.float32)
     bump = (0.5 * np.exp(-((x - 8) ** 2 + (y - 7) ** 2) / 2)).astype(np.float32)

@@ -180,7 +180,7 @@ def test_what_is_no_picture_is_refused(tmp_path: pathlib.Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.random.default_rng(0).integers(0, 255, (40, 40, 3), np.uint8))
     (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:-200])
     refused(SourceError, "is cut off", read_pictures, [tmp_path], "x")
-    for lost in ("contacts-00000.arrayrecord", ".journals"):  # pictures beside records are not the recorded ones
+    for lost in ("contacts-00000.arrayrecord", ".journals"):  # pictures next to records are not the recorded ones
         (tmp_path / lost / "backgrounds").mkdir(parents=True)
         (tmp_path / lost / lost).mkdir()
         refused(MissingIndexError, "has no index.json", read_pictures, [tmp_path / lost], "x")

@@ -115,7 +115,7 @@ def test_wrong_pictures_are_refused(tracker):
 
 
 def test_light_does_not_move_the_points(tracker):
-    """Gain, offset and a slope of brightness are fitted beside the motion; Lucas–Kanade alone follows the light."""
+    """Gain, offset and a slope of brightness are fitted with the motion; Lucas–Kanade alone follows the light."""
     plain = Tracker(REST, POINTS[INNER], 7, TrackingConfig(affine=False))
     picture = gels.exposed(0.7 * gels.dots(POINTS) + 0.3 * np.arange(200))
     errors = [np.hypot(*(t.track(picture).points_px - POINTS[INNER]).T) for t in (tracker, plain)]

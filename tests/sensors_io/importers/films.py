@@ -53,8 +53,8 @@ def uneven_film(path, times_ms, sound_s=0.0, **options):
 def entry(name, /, videos=2, **changes):
     """An object of the list; `videos` are names, or how many there are."""
     names = videos if isinstance(videos, list) else [f"{name}_{k}.avi" for k in range(videos)]
-    told = {"object": name, "name": f"a {name}", "split": "train", "material": "rubber", "videos": names}
-    return told | {"hardness": 1, "roughness": 0, "bumps": 2} | changes
+    described = {"object": name, "name": f"a {name}", "split": "train", "material": "rubber", "videos": names}
+    return described | {"hardness": 1, "roughness": 0, "bumps": 2} | changes
 
 
 def folder(path, *entries):

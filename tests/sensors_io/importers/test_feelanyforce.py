@@ -1,4 +1,4 @@
-"""FeelAnyForce: pictures with forces; the sign of pressing is inferred from a push, or told."""
+"""FeelAnyForce: pictures with forces; the sign of pressing is inferred from a push, or stated."""
 
 import dataclasses
 
@@ -43,11 +43,11 @@ def test_a_known_push_presses_whatever_sign_the_file_has(tmp_path, pushes, sign)
 
 
 @pytest.mark.parametrize(
-    ("readings", "told", "sign"),
+    ("readings", "stated", "sign"),
     [([0.15, -0.1], "infer", 1), ([0.1, 9.0, -2.0], "infer", -1), ([9.0], "negative", 1), ([-9.0], "positive", -1)],
 )
-def test_the_sign_can_be_told_and_is_left_alone_without_a_push(readings, told, sign):
-    assert pressing_sign(readings, told) == sign
+def test_the_sign_can_be_stated_and_is_left_alone_without_a_push(readings, stated, sign):
+    assert pressing_sign(readings, stated) == sign
 
 
 def test_rows_without_a_force_or_a_picture_are_counted(tmp_path):

@@ -61,7 +61,7 @@ def test_check_and_extract_read_what_an_import_kept_or_is_given(tmp_path, presse
     run(*videos, "--out", plain)
     run(*videos, "--out", kept, "--mm-per-px", 0.0634, "--background", rest)
     assert "not looked at: 1 sequences, no gel at rest" in run("check", plain, "--pictures", "--mm-per-px", 0.1268)
-    assert "nothing tells their mm per px" in run("check", plain, "--pictures", "--rest-frames", 1)
+    assert "their mm per px are unknown" in run("check", plain, "--pictures", "--rest-frames", 1)
     skin = fakes.write(tmp_path / "skin", 1, sensors=("tac3d",))
     assert "not looked at: 1 sequences, they hold no pictures" in run("check", skin, "--pictures")
     looked = [

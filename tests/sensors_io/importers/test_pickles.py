@@ -37,10 +37,10 @@ def test_damage_is_named(tmp_path):
 @pytest.mark.parametrize("data", [b"S" + b"x" * 10_000 + b"\n.", pickle.dumps("a\nb" * 1000)[:-1] + b"\x8c\x01c\x93."])
 def test_what_a_file_has_it_say_stays_one_short_line(tmp_path, data):
     (tmp_path / "a.pkl").write_bytes(data)
-    with pytest.raises(PickleError) as told:
+    with pytest.raises(PickleError) as raised:
         read_pickle(tmp_path / "a.pkl")
-    assert len(str(told.value)) < 300
-    assert "\n" not in str(told.value)
+    assert len(str(raised.value)) < 300
+    assert "\n" not in str(raised.value)
 
 
 def state(build, *state):

@@ -123,7 +123,7 @@ def test_frame_numbers_whose_times_64_bits_cannot_hold_are_refused():
 
 
 def test_links_are_followed_and_hidden_names_are_left_alone(tmp_path):
-    """macOS writes ._1.png beside 1.png on the disks of others, and a disk keeps what was deleted in .Trashes."""
+    """macOS writes ._1.png next to 1.png on the disks of others, and a disk keeps what was deleted in .Trashes."""
     folder = tmp_path / "clips"
     for name in ("1.png", "._1.png", ".Trashes/2.png", "mug/3.png"):
         picture(folder / name)

@@ -74,6 +74,6 @@ def test_a_table_that_ends_in_the_middle_of_a_row_is_refused(source, cut):
 
 def test_a_table_of_zeros_is_refused_in_a_short_line(source):
     (source / "data1" / "train.csv").write_bytes(bytes(10_000))
-    with pytest.raises(ImportSourceError, match="has the columns") as told:
+    with pytest.raises(ImportSourceError, match="has the columns") as raised:
         list_tvl(source, EVERYTHING)
-    assert len(str(told.value).removeprefix(str(source))) < 400
+    assert len(str(raised.value).removeprefix(str(source))) < 400

@@ -35,7 +35,7 @@ def clips(tmp_path):
     (root / "notes.txt").write_text("no clip")
     (root / "mug" / "3.wmv").write_text("of a kind that is not read")
     (root / "gone.mp4").symlink_to(root / "absent.mp4")
-    (root / "._cube.avi").write_text("what macOS writes beside cube.avi")
+    (root / "._cube.avi").write_text("what macOS writes next to cube.avi")
     return root
 
 

@@ -71,7 +71,7 @@ def test_one_wrong_reading_is_neither_a_press_nor_a_release(motion, at, wrong_n)
         advice = [coach.step(2_000_000 * k, np.array([0, 0, -n])) for k, n in enumerate(given)]
         ends.append([(a.phase, a.done) for a in advice])
         assert not any(a.prompt.startswith("STOP") for a in advice)
-    differing = [k for k, (right, told) in enumerate(zip(*ends, strict=True)) if right != told]
+    differing = [k for k, (right, disturbed) in enumerate(zip(*ends, strict=True)) if right != disturbed]
     assert len(differing) <= 2
 
 

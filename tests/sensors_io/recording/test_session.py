@@ -80,7 +80,7 @@ def test_a_stage_that_no_attempt_completes_is_named(tmp_path, monkeypatch):
 
 def test_free_motion_alone_needs_no_force_sensor(tmp_path):
     hand = Hand()
-    said = "gelsight_mini tells no force.*--free-s 10"
+    said = "gelsight_mini measures no force.*--free-s 10"
     refused(ForceError, said, record_session, tmp_path / "x", SHORT, [Camera(hand)], None, show=hand.show)
     config = dataclasses.replace(CONFIG, free_s=0.5)
     assert record_session(tmp_path, config, [Camera(hand)], None, show=hand.show).contacts == 1

@@ -72,7 +72,7 @@ def test_a_sensor_that_felt_nothing_is_named():
     said = r"tac3d against netft: signal b shows 0 taps"
     refused(OffsetsError, said, measure_offsets, heard(Feed("netft", 500)), late, "netft", "taps")
     refused(OffsetsError, "tac3d gave 0 samples", heard, of())
-    refused(OffsetsError, "nothing tells a touch", heard, of(Sample(host_time_ns=0)))
+    refused(OffsetsError, "nothing shows a touch", heard, of(Sample(host_time_ns=0)))
 
 
 def test_samples_unlike_most_are_left_out():

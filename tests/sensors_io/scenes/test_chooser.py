@@ -74,7 +74,7 @@ def test_errors_add_in_quadrature() -> None:
 
 
 def test_each_part_follows_its_formula() -> None:
-    """The two others are e⁻⁵⁰, nothing beside it."""
+    """The two others are e⁻⁵⁰, nothing compared with it."""
     seen, menu, first = _survey(_ball), MENU[:5], np.eye(len(FEATURES))[0]
     silent = dataclasses.replace(
         jax.tree.map(np.zeros_like, LAW), grid=-50 * first, stop=np.append(-50 * first, [0, 0]), wrap=-50 * np.eye(5)[0]
@@ -111,16 +111,16 @@ def test_a_survey_by_hand() -> None:
     pressure = np.pad(np.ones((4, 4), np.float32), 2)
     flat = tuple(np.zeros((n, n), np.float32) for n in (8, 16, 32))
     seen = surveyed(pressure, pressure, flat, jnp.float32(0.5), 8.0, 2.0)
-    told = dict(zip(FEATURES, np.asarray(seen.features), strict=True))
+    feature = dict(zip(FEATURES, np.asarray(seen.features), strict=True))
     least = np.log(1e-3)
-    assert told["1"] == 1
-    assert told["ln d₂"] == told["ln d₄"] == pytest.approx(least)
-    assert told["ln edge/area"] == pytest.approx(np.log(16 / 16))  # 4 sides of 4 pixels
-    assert told["ln gel's share"] == pytest.approx(np.log(0.5))
-    assert told["extent"] == 0.5
-    assert told["border"] == 0
-    assert told["ln a/h"] == pytest.approx(np.log(4 / np.sqrt(np.pi) / 2))
-    assert told["ln d₂ · ln d₄"] == pytest.approx(least**2)
+    assert feature["1"] == 1
+    assert feature["ln d₂"] == feature["ln d₄"] == pytest.approx(least)
+    assert feature["ln edge/area"] == pytest.approx(np.log(16 / 16))  # 4 sides of 4 pixels
+    assert feature["ln gel's share"] == pytest.approx(np.log(0.5))
+    assert feature["extent"] == 0.5
+    assert feature["border"] == 0
+    assert feature["ln a/h"] == pytest.approx(np.log(4 / np.sqrt(np.pi) / 2))
+    assert feature["ln d₂ · ln d₄"] == pytest.approx(least**2)
     assert float(seen.radius_mm) == pytest.approx(4 / np.sqrt(np.pi))
 
 

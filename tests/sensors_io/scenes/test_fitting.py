@@ -54,9 +54,9 @@ def test_the_field_is_the_gradient_of_its_depth(profiles: fitting.Profiles) -> N
 def test_optics_and_touches_are_found_again(presses: BallPictures, profiles: fitting.Profiles) -> None:
     train = np.arange(0, 16, 2)
     begun = _touches() + np.random.default_rng(3).uniform(-0.4, 0.4, (16, 3))
-    told: list[tuple[int, int]] = []
-    found, touches = fitting.fit_jointly(presses, profiles, begun, train, lambda *word: told.append(word))
-    assert told == [(n, fitting.ROUNDS + 1) for n in range(1, fitting.ROUNDS + 2)]
+    reported: list[tuple[int, int]] = []
+    found, touches = fitting.fit_jointly(presses, profiles, begun, train, lambda *word: reported.append(word))
+    assert reported == [(n, fitting.ROUNDS + 1) for n in range(1, fitting.ROUNDS + 2)]
     np.testing.assert_allclose(touches, _touches(), atol=0.1)
     held_out = [fitting.change(found, profiles, t, presses.axis_mm, presses.window_mm) for t in touches[1::2]]
     true = [fitting.change(MINI, profiles, t, presses.axis_mm, presses.window_mm) for t in _touches()[1::2]]

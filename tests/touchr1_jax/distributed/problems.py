@@ -131,7 +131,7 @@ def packed() -> TrainingProblem:
 
 
 def adapters() -> TrainingProblem:
-    """SFT whose decoder stands still under adapters of rank 2, beside encoders that are trained in full."""
+    """SFT whose decoder stands still under adapters of rank 2, with encoders that are trained in full."""
     plain = sft()
     base, towers = _apart(plain.state.params)
     trained = {"adapters": _adapters(base), **towers}

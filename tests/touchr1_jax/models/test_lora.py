@@ -84,7 +84,7 @@ def test_adapters_have_the_shapes_of_their_layers(base):
 
 @pytest.mark.long
 def test_merged_parameters_compute_the_same(base):
-    """Prompt, completion and their gradients by both ways; far from the base."""
+    """Prompt, completion and their gradients by both methods; far from the base."""
     adapters = loud(init_adapters(jax.random.key(0), base, LORA))
     fns = dataclasses.replace(FNS, lora=LORA, base=base)
     ours = logits(fns, {"adapters": adapters})

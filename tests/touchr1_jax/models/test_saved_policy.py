@@ -152,7 +152,7 @@ def replaced_until(folder, step, monkeypatch, exchange):
 
 @pytest.mark.parametrize("exchange", [True, False])
 def test_a_kill_at_any_point_leaves_the_old_folder_or_the_new_one(tmp_path, monkeypatch, exchange):
-    """Where folders cannot be exchanged, the old one may be beside its place, and the error says where."""
+    """Where folders cannot be exchanged, the old one may be next to its place, and the error says where."""
     seen, step = [], 0
     while not seen or seen[-1] is not None:
         folder = tmp_path / str(step) / "policy"
@@ -165,11 +165,11 @@ def test_a_kill_at_any_point_leaves_the_old_folder_or_the_new_one(tmp_path, monk
         else:
             with pytest.raises(PolicyError, match=r"a killed process left .*/\.policy\.\d+\.old: rename it to policy"):
                 read_policy(folder)
-            seen.append("told")
+            seen.append("named")
         if "killed" not in done:
             seen.append(None)
     kinds = list(dict.fromkeys(seen))
-    assert kinds == (["old", "new", None] if exchange else ["old", "told", "new", None])
+    assert kinds == (["old", "new", None] if exchange else ["old", "named", "new", None])
     assert [path.name for path in folder.parent.iterdir()] == ["policy"]
 
 

@@ -1,4 +1,4 @@
-"""Rewards at the corners of what can be answered, asked and felt: all finite, or named before training."""
+"""Rewards at the corners of what can be answered, asked and perceived: all finite, or named before training."""
 
 import dataclasses
 import itertools
@@ -57,12 +57,12 @@ def test_corners_are_those_of_the_docstring():
     parts = (targets.asked.sum(-1), targets.label[:, 0], targets.levels[:, 0], targets.ordinal[:, 0])
     found = zip(*(np.asarray(x).tolist() for x in (*parts, targets.streams.sum(-1))), strict=True)
     assert set(found) == {(a, x, k, o, n) for a, k, o, n in sizes for x in (-1, 0, k - 1)}
-    felt = {"⊥": (-1, -1, -1, -1), "lowest": (0, 0, 0, 0), "at odds": (0, 1, 0, 1), "highest": (2, 2, 2, 2)}
+    perceived = {"⊥": (-1, -1, -1, -1), "lowest": (0, 0, 0, 0), "at odds": (0, 1, 0, 1), "highest": (2, 2, 2, 2)}
     parts = (answers.perceive[:, :, 0], answers.conclude[:, 0], answers.formatted, answers.truncated, answers.length)
     found = zip(*(np.asarray(x).tolist() for x in parts), strict=True)
     bools = (False, True)
     assert {(tuple(x), *rest) for x, *rest in found} == {
-        (x, x[1], *rest) for x, *rest in itertools.product(felt.values(), bools, bools, (0, 1, 20))
+        (x, x[1], *rest) for x, *rest in itertools.product(perceived.values(), bools, bools, (0, 1, 20))
     }
 
 

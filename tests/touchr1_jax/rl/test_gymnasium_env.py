@@ -29,7 +29,7 @@ def test_without_gymnasium_the_error_says_what_to_install(monkeypatch):
 
 @pytest.fixture
 def env():
-    """Each action costs .25 beside its seconds."""
+    """Each action costs .25 besides its seconds."""
     pytest.importorskip("gymnasium")
     return make(reward=lambda *of: priced_answer(*of) | {"actions": -0.25 * of[2].actions})
 

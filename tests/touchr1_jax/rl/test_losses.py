@@ -257,7 +257,7 @@ def test_the_gap_of_the_sampler_is_that_of_rollouts_with_tokens():
 
 
 def test_the_entropy_is_that_of_rollouts_with_tokens():
-    """One rollout of .8 nat beside a masked one is above a floor of .5, and gets no more bonus."""
+    """One rollout of .8 nat with a masked one is above a floor of .5, and gets no more bonus."""
     nothing, mask = jnp.zeros((1, 2, 1)), jnp.array([[[True], [False]]])
     algorithm = Paper(beta=0.0, gamma=0.0, mask_truncated=True, entropy_weight=1.0, entropy_floor_nat=0.5)
     config = GRPOConfig(prompts=1, micro_prompts=1, group=2, length=1, algorithm=algorithm)

@@ -68,9 +68,9 @@ def test_actions_tokens_costs_and_answers_tell_one_story(legal):
             taken = list(actions) + [-1] * (BUDGET - len(actions))
             assert legal.action[p, g].tolist() == taken
             np.testing.assert_allclose(legal.seconds[p, g], BANK.seconds[which, list(actions)].sum(), rtol=1e-6)
-            felt = [BANK.available[which, a] for a in actions]
-            assert legal.harm[p, g] == sum(BANK.harm[which, a] for a, f in zip(actions, felt, strict=True) if f)
-            assert legal.exists[p, g].tolist() == [[f] * N for f in felt] + [[False] * N] * (BUDGET - len(actions))
+            possible = [BANK.available[which, a] for a in actions]
+            assert legal.harm[p, g] == sum(BANK.harm[which, a] for a, f in zip(actions, possible, strict=True) if f)
+            assert legal.exists[p, g].tolist() == [[f] * N for f in possible] + [[False] * N] * (BUDGET - len(actions))
             levels = [[words[0] for words in a.levels] for a in POLICY.language.attributes]
             assert legal.parsed.conclude[p, g].tolist() == [x.index(word) if word in x else -1 for x in levels]
             assert legal.rollout.mask[p, g].sum() == sum(map(len, explored.turn_ids(actions, word)))

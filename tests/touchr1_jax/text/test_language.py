@@ -1,4 +1,4 @@
-"""Languages that would be read in two ways are refused."""
+"""Ambiguous languages are refused."""
 
 import dataclasses
 

@@ -121,19 +121,19 @@ class TestDamage:
             checkpoints.save(n, self.numbers(n), None)
 
     def restored(self, stage):
-        told = []
-        with Checkpoints(stage, print_=told.append) as checkpoints:
-            return checkpoints.restore(self.numbers(0)), told
+        printed = []
+        with Checkpoints(stage, print_=printed.append) as checkpoints:
+            return checkpoints.restore(self.numbers(0)), printed
 
     @pytest.mark.parametrize("at", [0.5, *(pytest.param(at, marks=pytest.mark.slow) for at in (0.3, 0.7))])
     def test_an_older_checkpoint_takes_the_place_of_one_with_a_flipped_bit(self, stage, at):
         """Most bits lie in the numbers themselves, where reading notices nothing."""
         self.spoil(self.largest(stage / "2"), at)
-        found, told = self.restored(stage)
+        found, printed = self.restored(stage)
         assert (found.step, found.data) == (1, {"at": 1})
         np.testing.assert_array_equal(found.state["w"], self.numbers(1)["w"])
-        assert len(told) == 1
-        assert str(stage / "2") in told[0]
+        assert len(printed) == 1
+        assert str(stage / "2") in printed[0]
         assert (stage / "damaged-2").is_dir()
         with Checkpoints(stage) as checkpoints:
             checkpoints.save(2, self.numbers(2), None)  # its place is free
@@ -143,9 +143,9 @@ class TestDamage:
     def test_a_changed_iterator_does_not_pass(self, stage):
         path = stage / "2" / "data" / "metadata"
         path.write_text(path.read_text().replace('"at": 2', '"at": 7'))
-        found, told = self.restored(stage)
+        found, printed = self.restored(stage)
         assert found.data == {"at": 1}
-        assert "the checksum of data/metadata does not hold" in told[0]
+        assert "the checksum of data/metadata does not hold" in printed[0]
 
     @pytest.mark.parametrize(("source", "left"), [("mine", 1), ("other", 2)])
     def test_a_whole_checkpoint_of_another_step_or_stage_does_not_pass(self, tmp_path, source, left):
@@ -154,10 +154,10 @@ class TestDamage:
                 for n in (1, 2):
                     checkpoints.save(n, self.numbers(n), None)
         (tmp_path / source / "2").rename(tmp_path / "mine" / "3")
-        told: list[str] = []
-        with Checkpoints(tmp_path / "mine", print_=told.append, of="mine") as checkpoints:
+        printed: list[str] = []
+        with Checkpoints(tmp_path / "mine", print_=printed.append, of="mine") as checkpoints:
             assert checkpoints.restore(self.numbers(0)).step == left
-        assert f"is of {source} step 2: must be of mine step 3" in told[0]
+        assert f"is of {source} step 2: must be of mine step 3" in printed[0]
         with Checkpoints(tmp_path / "mine") as checkpoints:
             assert checkpoints.restore(self.numbers(0)).step == left
         with Checkpoints(tmp_path / "unnamed") as checkpoints:
@@ -199,8 +199,8 @@ class TestDamage:
                 self.save(stage, 3)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        found, told = self.restored(stage)
-        assert (found.step, told) == (2, [])
+        found, printed = self.restored(stage)
+        assert (found.step, printed) == (2, [])
 
     def test_a_checkpoint_that_will_not_fit_is_refused_before_it_is_written(self, stage, monkeypatch):
         usage = shutil.disk_usage(stage)
@@ -253,13 +253,13 @@ class TestDamagedBest:
         """Orbax reads scores before any checksum is compared, and leaves checkpoints without one out."""
         path = stage / "2" / "metrics" / "metrics"
         path.unlink() if text is None else path.write_text(text)
-        told = []
+        printed = []
         wanted = pytest.raises(DamagedCheckpointError, match=r"best of its stage: put a copy back, or move .* away")
-        with Checkpoints(stage, better="higher", print_=told.append) as checkpoints, wanted:
+        with Checkpoints(stage, better="higher", print_=printed.append) as checkpoints, wanted:
             assert checkpoints.restore(LIKE).step == 3
             checkpoints.best(LIKE)
-        assert "2: the checksum of its score does not hold; it is kept as damaged-2" in told[0]
-        assert "2, the best so far, is damaged or gone: put a copy back, unless a later one is as good" in told[1]
+        assert "2: the checksum of its score does not hold; it is kept as damaged-2" in printed[0]
+        assert "2, the best so far, is damaged or gone: put a copy back, unless a later one is as good" in printed[1]
 
     @pytest.mark.parametrize("score", [4.5, 5.0])
     def test_without_it_a_later_one_must_be_as_good(self, stage, score):
@@ -291,14 +291,14 @@ class TestDamagedBest:
         old = tmp_path_factory.mktemp("old") / "1"
         with Checkpoints(old.parent, better="higher") as checkpoints:
             checkpoints.save(1, {"x": jnp.full(2, 1)}, 1, 1.0)
-        told: list[str] = []
+        printed: list[str] = []
         for file in (None, *(path for path in old.rglob("*") if path.is_file())):
             shutil.copytree(old, stage / "1")
             if file is not None:
                 (stage / "1" / file.relative_to(old)).unlink()
-            with Checkpoints(stage, keep=1, better="higher", print_=told.append):
+            with Checkpoints(stage, keep=1, better="higher", print_=printed.append):
                 assert sorted(path.name for path in stage.iterdir()) == ["2", "3"]
-        assert not told
+        assert not printed
         shutil.copytree(old, stage / "1")
         with Checkpoints(stage, keep=2, better="higher"):
             assert sorted(path.name for path in stage.iterdir()) == ["2", "3"]
@@ -359,8 +359,8 @@ def test_a_failed_save_is_told_once(tmp_path, caplog):
     """
     where, score = Path(ocp.__file__).parent / "x.py", "Requested `tracked_metric`; did not provide metrics."
     said = [("absl", where, "no space", False), ("absl", tmp_path / "x.py", "no space", True)]
-    for name, path, text, told in (*said, ("orbax", where, "no space", True), ("absl", where, score, False)):
+    for name, path, text, printed in (*said, ("orbax", where, "no space", True), ("absl", where, score, False)):
         logger, level = logging.getLogger(name), logging.WARNING if text == score else logging.ERROR
         logger.handle(logger.makeRecord(name, level, str(path), 1, text, (), None))
-        assert (text in caplog.text) == told
+        assert (text in caplog.text) == printed
         caplog.clear()

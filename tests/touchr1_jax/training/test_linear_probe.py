@@ -40,7 +40,7 @@ def test_an_identity_leaks_nothing():
 
 @pytest.mark.long
 def test_a_row_is_read_by_a_probe_that_never_saw_its_object(problem):
-    """Other labels for an object's rows change what the others are told, and not what these rows are told."""
+    """Other labels for an object's rows change the predictions for the others, and not those for these rows."""
     features, labels, groups = problem
     before = cross_fit(features, labels, groups, K, CONFIG)
     mine = groups == "object_7"

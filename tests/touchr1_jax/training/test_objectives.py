@@ -29,7 +29,7 @@ def test_contrast_by_hand():
     embedding = jnp.array([[[3.0, 0.0], [1.0, 0.0]], [[0.0, 2.0], [0.0, 5.0]]])
     everything = jnp.ones((2, 2), bool)
     np.testing.assert_allclose(contrast_loss(embedding, everything, 0.5), np.log1p(np.exp(-2.0)), rtol=1e-5)
-    same = jnp.ones((2, 2, 2))  # nothing tells contacts apart: chance among two
+    same = jnp.ones((2, 2, 2))  # nothing distinguishes contacts: chance among two
     np.testing.assert_allclose(contrast_loss(same, everything, 0.5), np.log(2), rtol=1e-5)
 
 

@@ -42,7 +42,7 @@ WIDTH = 2 * N
 
 
 def make_batch(seed: int) -> SFTBatch:
-    """Questions felt by one sensor, the other or both; a contact without a view, one with a step without frames."""
+    """Questions with touch of one or both sensors; a contact without a view, one with a step without frames."""
     rng = np.random.default_rng(seed)
     streams = np.array([[1, 0], [0, 1], [1, 1], [1, 1]], bool)[rng.integers(0, 4, (P, Q))]
     asked = rng.integers(0, tiny.A, (P, Q))

@@ -1,4 +1,4 @@
-"""Which published tensor is which parameter, and how its axes lie there."""
+"""Which published tensor is which parameter, and the order of its axes."""
 
 import re
 from typing import NamedTuple

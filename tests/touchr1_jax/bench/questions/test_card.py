@@ -72,8 +72,8 @@ def test_a_common_answer_fails(items, source):
 
 
 def test_a_wording_that_tells_fails(items, source):
-    told = [change(item, phrasing=item.ask.answer[0]) if item.ask.kind == "scale" else item for item in items]
-    assert failing(told, source) == ["best answer to each wording over chance"]
+    reworded = [change(item, phrasing=item.ask.answer[0]) if item.ask.kind == "scale" else item for item in items]
+    assert failing(reworded, source) == ["best answer to each wording over chance"]
 
 
 def test_every_failed_check_is_named(items, source):

@@ -53,8 +53,8 @@ def test_names_and_factors_by_hand(folder):
     np.testing.assert_array_equal(theirs[merger], found["vision"]["merger_in"]["b"].T)
     layers, blocks = CONFIG.decoder.num_layers, CONFIG.vision.depth
     assert len(header) == 2 * (7 * layers + 3 * blocks + 1)
-    told = json.loads((folder / "adapter_config.json").read_text())
-    assert (told["peft_type"], told["r"], told["lora_alpha"], told["use_rslora"]) == ("LORA", 3, 5.0, True)
+    written = json.loads((folder / "adapter_config.json").read_text())
+    assert (written["peft_type"], written["r"], written["lora_alpha"], written["use_rslora"]) == ("LORA", 3, 5.0, True)
 
 
 def test_what_was_saved_is_loaded(folder):

@@ -182,7 +182,7 @@ def test_sft_with_adapters_and_a_whole_tactile_encoder():
 
 
 def test_half_precision_decodes_as_the_learner_scores(batch):
-    """Keys and values of a bfloat16 decoder are bfloat16; both ways agree to its rounding."""
+    """Keys and values of a bfloat16 decoder are bfloat16; both agree to its rounding."""
     half = jax.tree.map(lambda x: (0.5 * x).astype(jnp.bfloat16), {"decoder": small_policy.params()["decoder"]})
     fns, tokens = qwen_fns(POLICY, LAYOUT, TOKENIZER), completions(1, 2)
     features = jax.tree.map(lambda x: x[0], batch.features)

@@ -101,7 +101,7 @@ def batch():
 
 @pytest.mark.long
 def test_steps_are_blocks_after_their_time(policy, batch):
-    """The time and marks of a step without frames are absent, and both ways to tell which tokens exist agree."""
+    """The time and marks of a step without frames are absent, and both computations of which tokens exist agree."""
     fns, layout = policy.fns, policy.layout
     touch_time = fns.module.token_time(jnp.asarray(batch.frame_index), jnp.asarray(batch.frame_mask))[0]
     features = jax.eval_shape(lambda p, b: fns.encode(p, b), policy.init(0, batch), batch)
@@ -136,7 +136,7 @@ def test_steps_are_blocks_after_their_time(policy, batch):
 
 @pytest.mark.long
 def test_packed_rows_are_the_prompts(policy, batch):
-    """Levels reach the decoder both ways: hidden states of a prompt with a picture, and of a row that holds it."""
+    """Levels reach the decoder in both forms: hidden states of a prompt with a picture, and of a row that holds it."""
     fns, layout, params = policy.fns, policy.layout, policy.init(0, batch)
     tokens = jnp.asarray(np.random.default_rng(0).choice(np.flatnonzero(~policy.tokenizer.banned), 3), jnp.int32)
     features = jax.jit(lambda p, b: fns.encode(p, b))(params, jax.tree.map(jnp.asarray, batch))

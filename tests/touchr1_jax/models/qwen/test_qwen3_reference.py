@@ -96,7 +96,7 @@ def test_prompts_and_patches_are_those_of_the_processor(reference, frames):
     """An even number of frames, and an odd one, whose last is repeated.
 
     The processor of the release, of transformers 4.57, writes the steps in place of the template's two marks around a
-    video; 5.23 leaves these, which are the ones without a pad beside them.
+    video; 5.23 leaves these, which are the ones without a pad next to them.
     """
     name, _, found = reference
     vision = tiny.config_of(CASES[name]).vision
