@@ -36,7 +36,7 @@ GIB = 2**30
 MOST_PROCESSES, MOST_PORT = 2**20, 2**16 - 1
 
 LOOK_S = 2.0
-"""Seconds after which a lock is taken to be that of a process of the run."""
+"""Seconds after which a lock is that of a process of the run, and a file that is not there is not shared."""
 
 SAY_S, WAIT_S = 5.0, 300.0
 """Seconds after which a process says that it waits for the others of its run, and after which it ends."""
@@ -229,7 +229,7 @@ def require_common_folders(launch: Launch, processes: ProcessGroup, run: Path, c
     """
     seen = [run / "config.json"] + [_number_file(launch, cache, 0)] * (launch.coordinator is not None)
     for file in seen:
-        if not file.exists():
+        if not _soon(file.exists):
             raise DifferentProcessesError(
                 f"process {processes.index} does not see {file.absolute()}, which process 0 has written: all must "
                 "share runs-dir and cache-dir; give whole paths"
@@ -265,7 +265,7 @@ def _lock_number(launch: Launch, folder: Path) -> None:
 
 
 def _soon(found: Callable[[], bool]) -> bool:
-    """True once `found` is, in `LOOK_S` at most: others lock a file for a moment, to look at it."""
+    """True once `found` is, in `LOOK_S` at most: others lock a file for a moment, and network disks show one late."""
     until = time.monotonic() + LOOK_S
     while not found():
         if time.monotonic() > until:
