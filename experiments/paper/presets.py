@@ -64,8 +64,7 @@ def _study(
     contacts, prompts, micro_prompts = batch
     optimizer = OptimizerConfig(learning_rate=1e-5, lr_scale=lr_scale[0])
     sft = StudySFT(steps=steps[0], batch_size=contacts, micro_contacts=contacts, optimizer=optimizer)
-    grpo = dataclasses.replace(
-        GRPOConfig.paper(),
+    grpo = GRPOConfig(
         prompts=prompts,
         micro_prompts=micro_prompts,
         lr_scale=lr_scale[1],

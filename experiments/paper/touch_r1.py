@@ -102,9 +102,7 @@ COMPARED = ("acc", "omae", "csc", "mat_acc")
 PAIRS = ((ARM, SFT), (ARM, CONTINUED), (SFT, ZERO), (SFT, BLIND), (SFT, "constant"))
 """Each step of training, and the earlier one or the baseline that it is compared with."""
 
-GRPO = dataclasses.replace(
-    GRPOConfig.paper(), prompts=16, micro_prompts=2, length=96, lr_scale=10.0, bfloat16=True, remat=True
-)
+GRPO = GRPOConfig(prompts=16, micro_prompts=2, length=96, lr_scale=10.0, bfloat16=True, remat=True)
 """At ten times the paper's learning rate, which is for whole weights."""
 
 

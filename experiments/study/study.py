@@ -86,7 +86,7 @@ SMOKE = StudyConfig(
     scenes=SceneConfig(objects=60, sites=1),
     encoders=EncoderTrainingConfig(steps=12, batch_size=8),
     decoder=dataclasses.replace(DECODER, steps=6, batch_size=4, save_every=3),
-    grpo=dataclasses.replace(GRPOConfig.paper(), prompts=4, micro_prompts=2),
+    grpo=GRPOConfig(prompts=4, micro_prompts=2),
     grpo_steps=4,
 )
 """A study that takes under two minutes and learns nothing."""

@@ -95,7 +95,7 @@ class TrainingConfig(SourceConfig):
     """The decoder's phase of SFT on encoded contacts; the control that continues SFT has its batches and rates too."""
     anchor: float = 1.0
     """Weight of the verified answers' likelihood in GRPO, under recipe `touch`."""
-    grpo: GRPOConfig = GRPOConfig.paper()
+    grpo: GRPOConfig = GRPOConfig()
     more_rewards: Annotated[dict[str, float], by_name(float)] = dataclasses.field(default_factory=dict)
     """Rewards that every arm earns besides its own, as in `overlong 0.1 diversity 0.05`."""
     grpo_steps: int = 150

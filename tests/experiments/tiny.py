@@ -1,6 +1,5 @@
 """A study small enough for a test: sixteen objects, pictures of 28 px, one decoder layer, no encoder layer."""
 
-import dataclasses
 import io
 
 import jax
@@ -32,7 +31,7 @@ STUDY = StudyConfig(
     encoders=EncoderTrainingConfig(steps=2, batch_size=4),
     sft=StudySFT(steps=3, batch_size=4),
     decoder=SFTConfig(steps=2, batch_size=2, questions=2, save_every=1, optimizer=OptimizerConfig(learning_rate=1e-3)),
-    grpo=dataclasses.replace(GRPOConfig.paper(), prompts=2, group=3, length=20, micro_prompts=2),
+    grpo=GRPOConfig(prompts=2, group=3, length=20, micro_prompts=2),
     grpo_steps=2,
     samples=0,
 )

@@ -373,9 +373,10 @@ class GRPOConfig:
                 f"best_of is {best_of}: must be below group {self.group} (up to it for GLOBAL), and 1 for advantage "
                 "PER_REWARD and for segment_credit, which have no total to take the best of; lower it"
             )
-        cuts = f"top_p is {self.top_p}, min_p {self.min_p}"
-        if self.algorithm.enumerated is not None and (self.top_p, self.min_p) != (1, 0):
-            raise ValueError(f"{cuts}: must be 1 and 0 where enumerated is set, which counts all levels; change either")
+        for field in ("enumerated", "score_centering"):
+            if getattr(self.algorithm, field) and (self.top_p, self.min_p) != (1, 0):
+                cuts = f"top_p is {self.top_p}, min_p {self.min_p}"
+                raise ValueError(f"{cuts}: must be 1 and 0 where {field} is set, which needs all tokens; change either")
         if list(self.buckets) != sorted({n for n in self.buckets if 2 <= n < self.length}):
             raise ValueError(f"buckets is {self.buckets}: must ascend within 2 … {self.length - 1}; sort it")
 
@@ -383,16 +384,6 @@ class GRPOConfig:
     def drawn(self) -> int:
         """Prompts of a batch: `candidates` for each prompt that is learned from."""
         return self.prompts * self.algorithm.candidates
-
-    @staticmethod
-    def paper() -> "GRPOConfig":
-        """The published objective."""
-        return GRPOConfig(algorithm=Paper())
-
-    @staticmethod
-    def stable() -> "GRPOConfig":
-        """The bounded objective."""
-        return GRPOConfig(algorithm=Stable())
 
 
 def at_precision(config: GRPOConfig, params: Params) -> Params:

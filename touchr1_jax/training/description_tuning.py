@@ -64,9 +64,7 @@ class ReinforceConfig:
 
     steps: int = 0
     grpo: GRPOConfig = dataclasses.field(
-        default_factory=lambda: dataclasses.replace(
-            GRPOConfig.paper(), prompts=32, micro_prompts=32, length=LENGTH, lr_scale=300.0
-        )
+        default_factory=lambda: GRPOConfig(prompts=32, micro_prompts=32, length=LENGTH, lr_scale=300.0)
     )
 
 

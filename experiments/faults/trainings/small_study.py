@@ -51,7 +51,7 @@ STUDY = StudyConfig(
     encoders=EncoderTrainingConfig(steps=60, batch_size=4, save_every=3),
     sft=StudySFT(steps=60, batch_size=4, save_every=3),
     decoder=dataclasses.replace(DECODER, steps=30, batch_size=2, questions=2, save_every=3),
-    grpo=dataclasses.replace(GRPOConfig.paper(), prompts=2, group=3, length=20, micro_prompts=2),
+    grpo=GRPOConfig(prompts=2, group=3, length=20, micro_prompts=2),
     grpo_steps=60,
     grpo_save_every=3,
 )

@@ -191,15 +191,15 @@ def test_options_that_a_phase_does_not_read_are_refused(phase, change, said):
 def test_one_word_chooses_the_stable_engine_and_the_stable_rewards(policy, data):
     """`grpo.algorithm:stable` alone: rewards that touch must earn; `paper` keeps the weights that it is given."""
     loop = LoopConfig(steps=1)
-    paper = make_arm(policy, PUBLISHED, data.prior(), GRPOConfig.paper(), loop)
-    stable = make_arm(policy, PUBLISHED, data.prior(), GRPOConfig.stable(), loop)
+    paper = make_arm(policy, PUBLISHED, data.prior(), GRPOConfig(), loop)
+    stable = make_arm(policy, PUBLISHED, data.prior(), GRPOConfig(algorithm=Stable()), loop)
     assert paper.weights == PUBLISHED
     assert stable.weights == {"accuracy_strict": 0.6, "consistency_strict": 0.3, "format_strict": 0.1}
 
 
 def test_reports_name_the_preset_and_what_differs():
-    assert preset_name(GRPOConfig.paper()) == "paper"
-    assert preset_name(GRPOConfig.stable()) == "stable"
+    assert preset_name(GRPOConfig()) == "paper"
+    assert preset_name(GRPOConfig(algorithm=Stable())) == "stable"
     changed = GRPOConfig(algorithm=Stable(gamma=0.0, tactile_use=TactileUse.OFF), prompts=4)
     assert preset_name(changed) == "stable with gamma=0.0, tactile_use=off, prompts=4"
     assert preset_name(GRPOConfig(algorithm=DrGrpo())) == "drgrpo"

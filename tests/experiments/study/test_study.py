@@ -33,7 +33,7 @@ from tests.sensors_io.checks import refused
 from touchr1_jax.models.layers import SizeError
 from touchr1_jax.models.touch_policy import ModelConfig, check_model
 from touchr1_jax.rewards import Reward, RewardError
-from touchr1_jax.rl.config import GRPOConfig, Paper
+from touchr1_jax.rl.config import GRPOConfig, Paper, Stable
 from touchr1_jax.training.evaluation import Evaluation
 from touchr1_jax.training.linear_probe import ProbeConfig
 from touchr1_jax.types import Parsed
@@ -267,7 +267,7 @@ def test_a_reward_that_does_not_fit_is_named_with_its_arm(reward, message):
 
 def test_an_algorithm_that_no_arm_trains_by_is_refused():
     with pytest.raises(ValueError, match=r"grpo\.algorithm is stable: .* each has its own; leave it out"):
-        run_study(StudyConfig(grpo=GRPOConfig.stable()), {"full": PUBLISHED}, None, {"full": Paper()})  # type: ignore[arg-type]
+        run_study(StudyConfig(grpo=GRPOConfig(algorithm=Stable())), {"full": PUBLISHED}, None, {"full": Paper()})
 
 
 def test_reports_name_the_algorithm_by_which_arms_train():

@@ -26,7 +26,7 @@ from touchr1_jax.rl.config import (
 
 
 def test_paper_preset():
-    c, a = GRPOConfig.paper(), Paper()
+    c, a = GRPOConfig(), Paper()
     assert (c.group, a.beta, c.learning_rate, a.kl) == (8, 1e-3, 1e-6, "k3")
     assert (a.gamma, a.clip_low, a.clip_high, a.epsilon) == (0.01, 0.2, 0.2, 1e-4)
     assert a.advantage is Advantage.GROUP
@@ -47,7 +47,7 @@ def test_settings_are_given_by_name_and_never_change(kind):
 
 
 def test_stable_preset():
-    a = GRPOConfig.stable().algorithm
+    a = Stable()
     assert (a.kl, a.grounding_stop_masked, a.grounding_cap_nat, a.drop_degenerate) == ("exact", True, 1.0, True)
     assert (a.tactile_use, a.gamma, a.beta) == (TactileUse.RECOMMENDED, 0.01, 0.1)
     assert a.advantage is Advantage.BATCH
@@ -93,9 +93,15 @@ def test_the_best_of_a_whole_group_is_compared_with_that_of_others_alone(preset)
         GRPOConfig(algorithm=ReinforcePlusPlus(best_of=9))
 
 
-def test_an_enumerated_level_is_not_drawn_from_a_nucleus():
-    with pytest.raises(ValueError, match=r"top_p is 0.9, min_p 0.0: must be 1 and 0 where enumerated is set"):
-        GRPOConfig(top_p=0.9, algorithm=Paper(enumerated=Norm.NONE))
+@pytest.mark.parametrize(("field", "value"), [("enumerated", Norm.NONE), ("score_centering", 2)])
+def test_what_is_summed_over_all_tokens_is_not_drawn_from_a_nucleus(field, value):
+    """Tokens outside the nucleus of the learner would have log-probability −∞ in the sum."""
+    for cut in ({"top_p": 0.9}, {"min_p": 0.1}):
+        with pytest.raises(ValueError, match=rf"top_p is .*, min_p .*: must be 1 and 0 where {field} is set"):
+            GRPOConfig(**cut, algorithm=Paper(**{field: value}))
+
+
+def test_a_conclusion_that_is_not_learned_may_follow_a_moving_reference():
     assert Paper(enumerated=Norm.NONE, learn_conclusion=False, beta=0.0, reference_every=3).reference_every == 3
 
 
@@ -126,7 +132,7 @@ def test_bad_settings_are_named(change, message):
 
 
 def test_the_command_line_chooses_a_preset_and_changes_it():
-    default = dataclasses.replace(GRPOConfig.paper(), prompts=4)
+    default = GRPOConfig(prompts=4)
     assert tyro.cli(GRPOConfig, args=[], default=default) == default
     chosen = tyro.cli(GRPOConfig, args=["--group", "6", "algorithm:stable", "--algorithm.gamma", "0"], default=default)
     assert chosen == dataclasses.replace(default, group=6, algorithm=Stable(gamma=0.0))
