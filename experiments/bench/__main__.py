@@ -44,7 +44,7 @@ from touchr1_jax.bench.questions.generate import (
 from touchr1_jax.bench.questions.rules import FilteredItems, apply_rules
 from touchr1_jax.bench.scoring import BENCH_METRICS
 
-OUT = Console(highlight=False, emoji=False)
+OUT = Console(highlight=False, emoji=False, markup=False)
 
 KNOWN_ERRORS = (
     card.CardError, QuotaError, ContactError, ItemError, LinesError, SheetError, DamagedFileError, UserError, OSError,

@@ -127,7 +127,10 @@ class Context:
             return
         lines = self._log.lines_of_stages()
         for path in sorted(folder.rglob("*.json")):
-            stage, kept = path.relative_to(folder).with_suffix("").as_posix(), read_json(path)
+            stage = path.relative_to(folder).with_suffix("").as_posix()
+            if _STAGE.fullmatch(stage) is None:  # of another program, such as ._0.json or 0 (conflicted copy).json
+                continue
+            kept = read_json(path)
             with fitting(path):
                 number, _ = kept["lines"]
                 same = summary(lines.get(stage, [])[:number]) == kept["lines"]

@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import functools
 import io
 import os
 import sys
@@ -37,8 +38,9 @@ FIXES = {
 
 
 def _console(*, stderr: bool) -> rich.console.Console:
-    console = rich.console.Console(stderr=stderr, emoji=False)
-    return console if console.is_terminal else rich.console.Console(stderr=stderr, emoji=False, width=WIDTH)
+    make = functools.partial(rich.console.Console, stderr=stderr, emoji=False, markup=False)  # a path may hold [/x]
+    console = make()
+    return console if console.is_terminal else make(width=WIDTH)
 
 
 OUT, ERR = _console(stderr=False), _console(stderr=True)

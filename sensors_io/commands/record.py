@@ -265,7 +265,7 @@ def drawn(status: Status) -> rich.console.RenderableType:
     if status.force is not None:
         table.add_row("force sensor", f"{status.force.delivered} readings", f"lost {status.force.lost}")
     if status.alarm:
-        table.add_row("[bold red]alarm", f"[bold red]{status.alarm}", "")
+        table.add_row("alarm", status.alarm, "", style="bold red")
     style = "bold red" if advice.prompt.startswith("STOP") else "bold green" if advice.complete else "bold"
     title = f"{status.stage.motion} at {status.stage.force_n:g} N" if advice.target_n else status.stage.motion
     return rich.console.Group(rich.panel.Panel(advice.prompt, title=title, style=style, width=80), table)

@@ -105,7 +105,7 @@ class Stream:
         if samples and self.feed.counts.disconnects != self._disconnects:
             self._disconnects, self._settled_ns = self.feed.counts.disconnects, times[0] + round(_SETTLE_S * NS_PER_S)
         for time_ns, sample in zip(times, samples, strict=True):
-            if sample.frame is None or sample.frame.ndim != 3:
+            if sample.frame is None or sample.frame.dtype != np.uint8 or sample.frame.shape[2:] != (3,):
                 continue
             if rest_ns is None:
                 touched = self._background.looks_touched(sample.frame)

@@ -75,6 +75,16 @@ def test_check_counts_flags_and_verifies(run, tmp_path):
     assert "contacts-00001.arrayrecord" in err
 
 
+@pytest.mark.parametrize("name", ["cups [v2]", "[/x]"])
+def test_brackets_in_the_name_of_a_folder_are_shown(run, tmp_path, name):
+    records = tmp_path / name / "records"
+    fakes.write(records, 1)
+    export = ("export", records, "--to", "hdf5", "--out", tmp_path / name / "a")
+    for command in (("list", records), ("check", records), export):
+        status, out, err = run(*command)
+        assert (status, name in out) == (0, True), (command, out, err)
+
+
 def test_record_and_check_count_what_a_recording_leaves_out(run, tmp_path):
     """A camera that is plugged in again comes back with its own size; a killed session leaves a journal."""
     for n in range(12):

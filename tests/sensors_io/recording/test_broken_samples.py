@@ -216,6 +216,19 @@ def test_a_contact_that_cannot_be_stored_keeps_its_journal_and_later_sessions_go
     assert record_session(tmp_path, SHORT, [Camera(hand)], Scale(hand), show=hand.show).contacts == 2
 
 
+@pytest.mark.parametrize("frame", [np.zeros((4, 6, 4), np.uint8), np.zeros((4, 6, 3), np.float32)])
+def test_frames_that_are_no_rgb_pictures_do_not_stop_later_sessions(tmp_path, frame):
+    class Alien(Camera):
+        def drain(self):
+            return [dataclasses.replace(sample, frame=frame) for sample in super().drain()]
+
+    hand = Hand()
+    said = r"frames.*must be.*nothing is lost: .*cup-0-press-0\.refused"
+    refused(SchemaError, said, record_session, tmp_path, SHORT, [Alien(hand)], Scale(hand), show=hand.show)
+    hand = Hand()
+    assert record_session(tmp_path, SHORT, [Camera(hand)], Scale(hand), show=hand.show).contacts == 2
+
+
 def test_journals_stay_until_their_contacts_were_read_back(tmp_path, monkeypatch):
     hand = Hand()
 
