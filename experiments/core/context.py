@@ -120,6 +120,10 @@ class Context:
         if self._log is not None:
             write_sealed(self._stage_file(f"{_LOGGED}/{stage}"), {"lines": self._log.summary_of(stage)})
 
+    def has_sealed(self, stage: str) -> bool:
+        """True if lines of a stage were sealed, which every stage does that was saved or has ended."""
+        return self._stage_file(f"{_LOGGED}/{stage}").exists()
+
     def require_log(self) -> None:
         """`DamagedFileError` unless the log has all lines that `seal_log` has seen; no other look may be taken."""
         folder = self.directory / "stages" / _LOGGED

@@ -24,14 +24,18 @@ SETTINGS = (
 )
 """Settings of JAX that change results."""
 
-UNSUPPORTED = {
-    "jax_enable_x64": "it makes 64-bit numbers of what this code stores in 32 bits",
-    "jax_disable_jit": "training steps give their buffers away, which only compiled programs can do",
+UNSUPPORTED: Mapping[str, tuple[Any, str]] = {
+    "jax_enable_x64": (True, "it makes 64-bit numbers of what this code stores in 32 bits"),
+    "jax_disable_jit": (True, "training steps give their buffers away, which only compiled programs can do"),
+    "jax_numpy_rank_promotion": ("raise", "rewards and layers broadcast arrays of different rank"),
+    "jax_numpy_dtype_promotion": ("strict", "rewards and layers mix integers with floating-point numbers"),
 }
-"""Settings of JAX that no experiment runs with, and the reason."""
+"""Settings of JAX, each with the value that no experiment runs with, and the reason."""
 
 DEFAULTS: Mapping[str, Any] = {
     "eager_constant_folding": False,
+    "jax_debug_infs": False,
+    "jax_debug_nans": False,
     "jax_high_dynamic_range_gumbel": False,
     "jax_random_seed_offset": 0,
     "jax_softmax_custom_jvp": False,
@@ -67,9 +71,9 @@ HARMLESS = ("--xla_force_host_platform_device_count", "--xla_dump", "--xla_hlo_p
 
 def require_supported() -> None:
     """Refuse settings that no experiment runs with."""
-    for name, why in UNSUPPORTED.items():
-        if jax.config.values[name]:
-            raise ConfigurationError(f"{name} is True: must be False, since {why}; unset {name.upper()}")
+    for name, (value, why) in UNSUPPORTED.items():
+        if jax.config.values[name] == value:
+            raise ConfigurationError(f"{name} is {value}: must keep its default, since {why}; unset {name.upper()}")
 
 
 def settings() -> dict[str, Any]:

@@ -339,7 +339,8 @@ class SeedTraining(StudySeed):
             self._evaluate_all(name, self._continue(name, params, contacts, validation), test, contacts.noise)
 
     def _evaluate_blind(self) -> None:
-        if not self._path(BLIND).exists():
+        """The policy without touch; its answers may be there without its log, in a run that was copied in part."""
+        if not (self._path(BLIND).exists() and self.context.has_sealed(f"blind/{self.seed}")):
             params = self._train_blind()
             unseen = self.encode(params, "test", blind=True)
             self._evaluate(BLIND, lambda: self.ask(params, unseen, samples=self.config.samples))

@@ -90,7 +90,9 @@ def test_a_foreign_line_is_named_before_anything_is_trained(tmp_path, line):
 def test_lines_of_a_stage_that_has_ended_are_missed(context, kept):
     for step in range(3):
         context.log("sft/0", step, loss=1 / (1 + step))
+    assert not context.has_sealed("sft/0")
     context.seal_log("sft/0")
+    assert context.has_sealed("sft/0")
     context.log("sft/0", 3, probe=0.5)
     context.require_log()
     path = context.directory / "metrics.jsonl"

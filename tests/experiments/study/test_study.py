@@ -265,6 +265,24 @@ def test_a_reward_that_does_not_fit_is_named_with_its_arm(reward, message):
         check_arms({"published": PUBLISHED, "mine": {"brevty": 1.0}})
 
 
+@pytest.mark.parametrize(("answered", "sealed"), [(False, False), (True, False), (True, True)])
+def test_a_policy_without_touch_that_has_answers_but_no_log_is_trained(tmp_path, answered, sealed):
+    """A run that was restored in part had answers of the finished run: its log lacked the stage without a word."""
+    trained, file = [], tmp_path / "answers.npz"
+    if answered:
+        file.touch()
+    seed = SimpleNamespace(
+        seed=0,
+        context=SimpleNamespace(has_sealed=lambda stage: sealed and stage == "blind/0"),
+        encode=lambda *_, **__: None,
+        _path=lambda name: file,
+        _train_blind=lambda: trained.append(1),
+        _evaluate=lambda *_: None,
+    )
+    SeedTraining._evaluate_blind(seed)
+    assert bool(trained) == (not sealed)
+
+
 def test_an_algorithm_that_no_arm_trains_by_is_refused():
     with pytest.raises(ValueError, match=r"grpo\.algorithm is stable: .* each has its own; leave it out"):
         run_study(StudyConfig(grpo=GRPOConfig(algorithm=Stable())), {"full": PUBLISHED}, None, {"full": Paper()})
