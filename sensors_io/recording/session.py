@@ -280,7 +280,7 @@ class _Session:
     def _forces(self, looked: Seq[list[Sample]], journal: JournalWriter) -> tuple[np.ndarray, np.ndarray]:
         """Times [n] and forces [n, 3] on the gel: the force sensor's, else those of a tactile sensor."""
         if self._force is not None:
-            measured = self._measured(self._force.drain(), journal)
+            measured = self._measured(self._force, journal)
             self._watch(measured[0], looked)
             return measured
         with_force = [i for i, samples in enumerate(looked) if samples and "force_n" in samples[0].arrays]
@@ -288,7 +288,7 @@ class _Session:
             self._leads = self._streams[with_force[0]]
         if self._leads is not None:
             samples = looked[self._streams.index(self._leads)]
-            return self._leads.time_ns(samples), _stacked(samples, "force_n")
+            return self._leads.time_ns(samples), _stacked(samples, "force_n", self._leads.sensor)
         if not self._config.free_s and all(stream.feed.counts.delivered for stream in self._streams):
             names = ", ".join(stream.sensor for stream in self._streams)
             raise ForceError(
@@ -299,10 +299,11 @@ class _Session:
         every = np.sort(np.concatenate(times))
         return every, np.zeros((len(every), 3))
 
-    def _measured(self, samples: list[Sample], journal: JournalWriter) -> tuple[np.ndarray, np.ndarray]:
+    def _measured(self, sensor: SampleReader, journal: JournalWriter) -> tuple[np.ndarray, np.ndarray]:
         """Readings of the force sensor, compensated, in the gel's frame; journaled."""
+        samples, name = sensor.drain(), sensor.identity.sensor
         times = np.array([s.host_time_ns for s in samples], np.int64)
-        force, moment = _stacked(samples, "force_n"), _stacked(samples, "moment_nmm", lacking=0.0)
+        force, moment = _stacked(samples, "force_n", name), _stacked(samples, "moment_nmm", name, lacking=0.0)
         beyond = np.array([bool(s.arrays.get("out_of_range", False)) for s in samples], bool)
         with np.errstate(invalid="ignore"):  # of readings that are not finite, which are journaled as they are
             if self._config.gravity is not None:
@@ -356,6 +357,14 @@ def _forget_before(then: tuple[int, Phase | None, int], journal: JournalWriter, 
             journal.append("phase", {"time_ns": time_ns, "phase": int(phase)})
 
 
-def _stacked(samples: list[Sample], name: str, lacking: float = np.nan) -> np.ndarray:
-    """A vector of every sample, float64 [n, 3]; `lacking` where one has none."""
-    return np.array([s.arrays.get(name, np.full(3, lacking)) for s in samples], np.float64).reshape(-1, 3)
+def _stacked(samples: list[Sample], name: str, sensor: str, lacking: float = np.nan) -> np.ndarray:
+    """A vector of every sample of a sensor, float64 [n, 3]; `lacking` where one has none.
+
+    Raises:
+      DeviceError: an array of another shape, or of no numbers.
+    """
+    found = [np.asarray(s.arrays.get(name, np.full(3, lacking))) for s in samples]
+    for x in found:
+        if x.shape != (3,) or x.dtype.kind not in "fiu":
+            raise DeviceError(f"{name} of {sensor} has shape {x.shape}, type {x.dtype}: must be 3 numbers; correct it")
+    return np.array(found, np.float64).reshape(-1, 3)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sensors_io.devices.base import Identity, Sample
+from sensors_io.devices.errors import DeviceError
 from sensors_io.recording.assemble import _gaps, assemble
 from sensors_io.recording.journal import JournalError, JournalWriter
 from sensors_io.recording.session import record_session
@@ -225,6 +226,22 @@ def test_frames_that_are_no_rgb_pictures_do_not_stop_later_sessions(tmp_path, fr
     hand = Hand()
     said = r"frames.*must be.*nothing is lost: .*cup-0-press-0\.refused"
     refused(SchemaError, said, record_session, tmp_path, SHORT, [Alien(hand)], Scale(hand), show=hand.show)
+    hand = Hand()
+    assert record_session(tmp_path, SHORT, [Camera(hand)], Scale(hand), show=hand.show).contacts == 2
+
+
+@pytest.mark.parametrize("force", [np.zeros(6, np.float32), np.float32(-3), np.array(["1", "2", "3"])])
+def test_a_force_that_is_no_vector_ends_the_session_in_one_line(tmp_path, force):
+    """It was a traceback."""
+
+    class Alien(Scale):
+        def drain(self):
+            return [dataclasses.replace(s, arrays={**s.arrays, "force_n": force}) for s in super().drain()]
+
+    hand = Hand()
+    refused(
+        DeviceError, "must be 3 numbers", record_session, tmp_path, SHORT, [Camera(hand)], Alien(hand), show=hand.show
+    )
     hand = Hand()
     assert record_session(tmp_path, SHORT, [Camera(hand)], Scale(hand), show=hand.show).contacts == 2
 
