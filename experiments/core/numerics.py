@@ -34,7 +34,6 @@ UNSUPPORTED: Mapping[str, tuple[Any, str]] = {
 
 DEFAULTS: Mapping[str, Any] = {
     "eager_constant_folding": False,
-    "jax_debug_infs": False,
     "jax_debug_nans": False,
     "jax_high_dynamic_range_gumbel": False,
     "jax_random_seed_offset": 0,
