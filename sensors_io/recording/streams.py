@@ -9,6 +9,7 @@ import numpy as np
 from sensors_io.clock import NS_PER_S
 from sensors_io.devices.background import Drift, GelBackground
 from sensors_io.devices.base import Identity, Sample
+from sensors_io.devices.errors import DeviceDataError
 from sensors_io.devices.intake import Counts
 from sensors_io.recording.journal import JournalWriter
 
@@ -119,7 +120,11 @@ class Stream:
                 self._drift = self._background.drift()
 
     def journal(self, samples: list[Sample], journal: JournalWriter) -> None:
-        """Journal frames of a contact, behind those just before it."""
+        """Journal frames of a contact, behind those just before it.
+
+        Raises:
+          DeviceDataError: an array of anything but numbers, such as the objects that NumPy makes of ragged lists.
+        """
         whole = [*self._before, *samples]
         self._before.clear()
         times = self.time_ns(whole).tolist()
@@ -130,8 +135,11 @@ class Stream:
                 "device_time_ns": sample.device_time_ns,
                 "index": sample.index,
             }
-            picture = {} if sample.frame is None else {"frame": sample.frame}
-            journal.append("frame", plain, **picture, **sample.arrays)
+            arrays = sample.arrays if sample.frame is None else {"frame": sample.frame, **sample.arrays}
+            for name, x in arrays.items():
+                if (dtype := np.asarray(x).dtype).kind not in "biuf":
+                    raise DeviceDataError(f"{name} of {self.sensor} has type {dtype}: must be numbers; correct it")
+            journal.append("frame", plain, **arrays)
         self.frames += len(whole)
 
     @property

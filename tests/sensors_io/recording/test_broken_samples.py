@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sensors_io.devices.base import Identity, Sample
-from sensors_io.devices.errors import DeviceError
+from sensors_io.devices.errors import DeviceDataError, DeviceError
 from sensors_io.recording.assemble import _gaps, assemble
 from sensors_io.recording.journal import JournalError, JournalWriter
 from sensors_io.recording.session import record_session
@@ -244,6 +244,18 @@ def test_a_force_that_is_no_vector_ends_the_session_in_one_line(tmp_path, force)
     )
     hand = Hand()
     assert record_session(tmp_path, SHORT, [Camera(hand)], Scale(hand), show=hand.show).contacts == 2
+
+
+@pytest.mark.parametrize("value", [np.array([["1", "2"]]), np.array([[1], [2, 3]], object)])
+def test_fields_that_are_no_numbers_end_the_session_and_leave_the_rest(tmp_path, value):
+    """The journal of one such sample could not be read, and stopped every later session."""
+    hand = Hand()
+    odd = Odd(hand, with_arrays(depth_mm=value))
+    said = "depth_mm of tac3d has type .*: must be numbers"
+    refused(DeviceDataError, said, record_session, tmp_path, FREE, [Camera(hand), odd], None, show=hand.show)
+    assert len(RecordStore(tmp_path, allow_incomplete=True).contact(0)["tac3d"]) == 19
+    hand = Hand()
+    assert record_session(tmp_path, FREE, [Camera(hand), Skin(hand)], None, show=hand.show).contacts == 1
 
 
 def test_journals_stay_until_their_contacts_were_read_back(tmp_path, monkeypatch):
