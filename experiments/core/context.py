@@ -121,7 +121,7 @@ class Context:
             write_sealed(self._stage_file(f"{_LOGGED}/{stage}"), {"lines": self._log.summary_of(stage)})
 
     def has_sealed(self, stage: str) -> bool:
-        """True if lines of a stage were sealed, which every stage does that was saved or has ended."""
+        """True if `seal_log` has seen a stage, as it does when the stage is saved or ends."""
         return self._stage_file(f"{_LOGGED}/{stage}").exists()
 
     def require_log(self) -> None:
