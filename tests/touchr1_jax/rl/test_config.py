@@ -95,7 +95,7 @@ def test_the_best_of_a_whole_group_is_compared_with_that_of_others_alone(preset)
 
 @pytest.mark.parametrize(("field", "value"), [("enumerated", Norm.NONE), ("score_centering", 2)])
 def test_what_is_summed_over_all_tokens_is_not_drawn_from_a_nucleus(field, value):
-    """Tokens outside the nucleus of the learner would have log-probability −∞ in the sum."""
+    """The sum is over all tokens, while a drawn token has its probability within the nucleus."""
     for cut in ({"top_p": 0.9}, {"min_p": 0.1}):
         with pytest.raises(ValueError, match=rf"top_p is .*, min_p .*: must be 1 and 0 where {field} is set"):
             GRPOConfig(**cut, algorithm=Paper(**{field: value}))
