@@ -304,6 +304,7 @@ def _execute(experiment: Experiment[Any], command: Any, about: str, typed: str) 
         with watched(processes.count, processes.index, common, fate):
             require_backend()
             require_accelerators(command.scale, experiment.needs.get(command.scale))
+            processes = processes.numbered_by_devices()
             chosen, resumed = processes.broadcast(lambda: _directory(experiment, command, typed))
             directory = Path(chosen)
             require_common_folders(command.launch, processes, directory, command.cache_dir / COMPILED)

@@ -19,7 +19,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import jax
 import numpy as np
@@ -104,6 +104,10 @@ class ProcessGroup:
     def writes(self) -> bool:
         """True in the one process that writes files."""
         return self.index == 0
+
+    def numbered_by_devices(self) -> Self:
+        """The same processes in the order of their devices, in which JAX gathers; on TPUs it may be another one."""
+        return self if self.count == 1 else type(self)(jax.process_count(), jax.process_index())
 
     def write_once(self, write: Callable[[], object]) -> None:
         """Let process 0 write files, between two barriers; all processes must make the same calls.
@@ -222,13 +226,14 @@ def join_processes(
 
 
 def require_common_folders(launch: Launch, processes: ProcessGroup, run: Path, cache: Path) -> None:
-    """Check that this process sees the run's configuration, and the file of process 0 in the cache.
+    """Check that this process sees the run's configuration, and the file of process 0 in the cache; all must call it.
 
     Raises:
       DifferentProcessesError: it is in another working directory, or on a disk of its own.
     """
-    seen = [run / "config.json"] + [_number_file(launch, cache, 0)] * (launch.coordinator is not None)
-    for file in seen:
+    own = None if launch.coordinator is None else _number_file(launch, cache, launch.process).name
+    name = processes.broadcast(lambda: own)  # others may have been given its address in another spelling
+    for file in (run / "config.json", *([cache / name] if name else [])):
         if not _soon(file.exists):
             raise DifferentProcessesError(
                 f"process {processes.index} does not see {file.absolute()}, which process 0 has written: all must "

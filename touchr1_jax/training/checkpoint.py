@@ -121,9 +121,7 @@ class Checkpoints:
 
     def __exit__(self, *exc: object) -> None:
         try:
-            wait_for_save(self._manager, self._directory)
-        except FAILURES as error:
-            raise self._unsaved(error) from error
+            self._wait()
         finally:
             if jax.process_count() == 1 or failed_save(self._directory) is None:
                 self._manager.close()
@@ -157,8 +155,8 @@ class Checkpoints:
         )
         others = threading.current_thread() is not threading.main_thread()
         self._before_save()
+        self._wait()
         try:
-            wait_for_save(self._manager, self._directory)
             self._saving = step
             with _SAVES if others else contextlib.nullcontext():
                 self._manager.save(step, args=args, metrics=None if score is None else {"score": score})
@@ -204,9 +202,9 @@ class Checkpoints:
         """The checkpoint with the best score, or `None` if none has a score.
 
         Raises:
-          CheckpointError: it is damaged, or holds another tree or other shapes.
+          CheckpointError: it is damaged, or holds another tree or other shapes; the last save did not reach the disk.
         """
-        self._manager.wait_until_finished()
+        self._wait()
         if self._better and self._best is None:
             self.restore(like)
         if not self._better or self._best is None:
@@ -218,6 +216,12 @@ class Checkpoints:
                 f"{error}; it is the best of its stage: put a copy back, or move {self._directory} away to train this "
                 "stage from its beginning"
             ) from error
+
+    def _wait(self) -> None:
+        try:
+            wait_for_save(self._manager, self._directory)
+        except FAILURES as error:
+            raise self._unsaved(error) from error
 
     def _is_best(self, score: float) -> bool:
         """True if no checkpoint so far is better; of equal ones Orbax keeps the newest."""

@@ -23,6 +23,7 @@ from experiments.core.runner import Experiment, main, run_experiment
 from experiments.faults.trainings import PACKAGE
 from tests.experiments.fakes import coin
 from touchr1_jax.distributed import processes
+from touchr1_jax.distributed.companions import DifferentProcessesError
 from touchr1_jax.distributed.processes import (
     SINGLE_PROCESS,
     Accelerators,
@@ -31,6 +32,7 @@ from touchr1_jax.distributed.processes import (
     ProcessGroup,
     join_processes,
     require_accelerators,
+    require_common_folders,
     select_devices,
 )
 from touchr1_jax.training.compilation import OLDER_LOOPS
@@ -128,6 +130,26 @@ def test_files_of_an_earlier_run_refuse_nobody_while_others_look_at_them(tmp_pat
         ended.start()
         processes._lock_number(Launch(distributed=True, coordinator="127.0.0.1:1", processes=2, process=1), tmp_path)
         ended.join()
+
+
+def test_processes_may_spell_the_address_of_the_first_in_their_own_ways(tmp_path, monkeypatch):
+    """Process 0 was given localhost; the file of its number is named so."""
+    launch = Launch(distributed=True, coordinator="127.0.0.1:1", processes=2, process=1)
+    monkeypatch.setattr(ProcessGroup, "broadcast", lambda group, choose: ".process-0-of-localhost:1")
+    monkeypatch.setattr(processes, "LOOK_S", 0.0)
+    (tmp_path / "config.json").touch()
+    with pytest.raises(DifferentProcessesError, match=r"does not see .*/\.process-0-of-localhost:1, which"):
+        require_common_folders(launch, ProcessGroup(2, 1), tmp_path, tmp_path)
+    (tmp_path / ".process-0-of-localhost:1").touch()
+    require_common_folders(launch, ProcessGroup(2, 1), tmp_path, tmp_path)
+
+
+def test_processes_are_numbered_as_jax_gathers(monkeypatch):
+    """The devices of TPUs may have another order than the processes joined in."""
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    monkeypatch.setattr(jax, "process_index", lambda: 0)
+    assert ProcessGroup(2, 1).numbered_by_devices() == ProcessGroup(2, 0)
+    assert SINGLE_PROCESS.numbered_by_devices() is SINGLE_PROCESS
 
 
 @pytest.mark.long

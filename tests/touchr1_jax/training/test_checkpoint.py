@@ -13,6 +13,7 @@ import orbax.checkpoint as ocp
 import pytest
 
 from tests.touchr1_jax.training.stepping import feed, start, step
+from touchr1_jax.training import checkpoint
 from touchr1_jax.training.checkpoint import CheckpointError, Checkpoints, DamagedCheckpointError, digest
 from touchr1_jax.training.checksums import CHECKSUMS, old_checkpoints
 
@@ -223,6 +224,18 @@ class TestBest:
             assert checkpoints.restore({"x": jnp.zeros(2)}).step == 6
         assert (found.step, found.data) == (best, best)
         np.testing.assert_array_equal(found.state["x"], best)
+
+    def test_a_last_save_that_fails_is_named_where_the_best_is_asked(self, tmp_path, monkeypatch):
+        def fail(manager, directory):
+            raise ValueError("quota")
+
+        with Checkpoints(tmp_path, better="higher") as checkpoints:
+            checkpoints.save(1, LIKE, None, 3.0)
+            checkpoints.best(LIKE)
+            monkeypatch.setattr(checkpoint, "wait_for_save", fail)
+            with pytest.raises(CheckpointError, match=r"did not reach .*: quota"):
+                checkpoints.best(LIKE)
+            monkeypatch.undo()
 
     @pytest.mark.parametrize(("better", "score"), [("higher", float("nan")), (None, 1.0)])
     def test_a_score_that_ranks_nothing_is_refused(self, tmp_path, better, score):
