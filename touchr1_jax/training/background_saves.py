@@ -25,8 +25,9 @@ def _not_of_a_failed_save(record: logging.LogRecord) -> bool:
     quiet = record.levelno < logging.ERROR and "tracked_metric" not in str(record.msg)
     if quiet or "/orbax/" not in record.pathname:
         return True
-    if record.exc_info and isinstance(record.exc_info[1], FAILURES):
-        _FAILED.append((record.getMessage(), record.exc_info[1]))
+    error = record.exc_info and record.exc_info[1]
+    if isinstance(error, FAILURES) and jax.process_count() > 1:  # kept, it holds the arrays of its traceback
+        _FAILED.append((record.getMessage(), error))
     return False
 
 

@@ -174,6 +174,14 @@ def test_odd_contacts_of_recordings_are_listed_before_training_and_left_out_on_r
     assert survey_contacts(GENERATED, store.path, context) == SurveyedContacts()
 
 
+def test_a_picture_of_one_colour_has_no_other_pixel():
+    picture = np.tile(np.uint8([1, 2, 3]), (4, 5, 1))
+    assert sources._is_even(picture)
+    assert not sources._is_even(None)
+    picture[3, 4, 2] = 4
+    assert not sources._is_even(picture)
+
+
 def test_recordings_that_differ_in_a_time_or_a_view_are_others(data, tmp_path, context):
     """The root of their index is the same: a trained encoder would be taken from the cache for the others too."""
     store = data.store

@@ -38,6 +38,13 @@ def test_a_failed_save_is_raised_though_orbax_waits_for_the_other_processes(tmp_
     barrier.set()
 
 
+def test_a_process_alone_keeps_no_errors_with_the_arrays_of_their_tracebacks(tmp_path, monkeypatch):
+    """Saves of a training that tries again and again."""
+    monkeypatch.setattr(jax, "process_count", lambda: 1)
+    log_failure(tmp_path, OSError("disk quota exceeded"))
+    assert failed_save(tmp_path) is None
+
+
 def test_an_error_of_the_wait_itself_is_raised(tmp_path):
     def fail():
         raise ValueError("barrier timed out")
