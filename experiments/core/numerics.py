@@ -7,13 +7,12 @@ order.  The number of devices does change bits; the cache of policies counts the
 
 import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import jax
 
 from experiments.core.errors import ConfigurationError
-from touchr1_jax.training.compilation import FLAGS, processor
+from touchr1_jax.training.compilation import FLAGS, processor, xla_flags
 
 SETTINGS = (
     "jax_default_matmul_precision",
@@ -26,6 +25,9 @@ SETTINGS = (
 
 UNSUPPORTED: Mapping[str, tuple[Any, str]] = {
     "jax_enable_x64": (True, "it makes 64-bit numbers of what this code stores in 32 bits"),
+    **{f"jax_error_checking_behavior_{x}": ("raise", "its checks cannot be batched") for x in ("divide", "nan", "oob")},
+    "jax_no_execution": (True, "nothing would be computed"),
+    "jax_no_tracing": (True, "programs are made by tracing"),
     "jax_disable_jit": (True, "training steps give their buffers away, which only compiled programs can do"),
     "jax_numpy_rank_promotion": ("raise", "rewards and layers broadcast arrays of different rank"),
     "jax_numpy_dtype_promotion": ("strict", "rewards and layers mix integers with floating-point numbers"),
@@ -71,16 +73,13 @@ HARMLESS = ("--xla_force_host_platform_device_count", "--xla_dump", "--xla_hlo_p
 def require_supported() -> None:
     """Refuse settings that no experiment runs with."""
     for name, (value, why) in UNSUPPORTED.items():
-        if jax.config.values[name] == value:
+        if jax.config.values.get(name) == value:
             raise ConfigurationError(f"{name} is {value}: must keep its default, since {why}; unset {name.upper()}")
 
 
 def settings() -> dict[str, Any]:
     """The settings of JAX, flags of XLA and variables of the environment that change results."""
-    given = os.environ.get(FLAGS, "").strip()
-    if given and not given.startswith("-") and Path(given).is_file():  # XLA then reads its flags from there
-        given = Path(given).read_text(encoding="utf-8")
-    counted = (flag for flag in given.split() if not flag.startswith(HARMLESS))
+    counted = (flag for flag in xla_flags().split() if not flag.startswith(HARMLESS))
     flags = sorted(counted, key=lambda flag: f"{flag.partition('=')[0]}=")  # of one name in their order, as XLA does
     found = {name: jax.config.values[name] for name in SETTINGS} | {FLAGS: flags}
     now = {name: jax.config.values.get(name, default) for name, default in DEFAULTS.items()}

@@ -77,8 +77,8 @@ def compiled_quickly() -> Iterator[None]:
     the older loops.
     """
     flags, before = os.environ.get(FLAGS), jax.config.values["jax_disable_most_optimizations"]
-    if OLDER_LOOPS not in (flags or ""):
-        os.environ[FLAGS] = f"{flags or ''} {OLDER_LOOPS}".strip()
+    if OLDER_LOOPS not in xla_flags():
+        os.environ[FLAGS] = f"{xla_flags()} {OLDER_LOOPS}".strip()
     jax.config.update("jax_disable_most_optimizations", True)
     try:
         yield
@@ -88,6 +88,13 @@ def compiled_quickly() -> Iterator[None]:
             os.environ.pop(FLAGS, None)
         else:
             os.environ[FLAGS] = flags
+
+
+def xla_flags() -> str:
+    """Flags given to XLA: those of the environment variable, or of the file that it names."""
+    given = os.environ.get(FLAGS, "").strip()
+    named = given and not given.startswith("-") and Path(given).is_file()
+    return Path(given).read_text(encoding="utf-8").strip() if named else given
 
 
 def committed(tree: Any) -> Any:

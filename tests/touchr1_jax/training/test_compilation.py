@@ -147,6 +147,19 @@ def test_flags_of_the_user_stay(well, monkeypatch):
     assert os.environ[FLAGS] == "--xla_force_host_platform_device_count=2"
 
 
+def test_flags_of_a_file_are_given_with_the_older_loops(well, monkeypatch, tmp_path):
+    """XLA takes a variable without a dash as the name of a file, and ends the process where there is none."""
+    (tmp_path / "flags of ours").write_text("--xla_dump_hlo_as_text=false\n--xla_force_host_platform_device_count=2\n")
+    monkeypatch.setenv(FLAGS, str(tmp_path / "flags of ours"))
+    with compiled_quickly(), compiled_quickly():
+        assert os.environ[FLAGS].split()[:2] == [
+            "--xla_dump_hlo_as_text=false",
+            "--xla_force_host_platform_device_count=2",
+        ]
+        assert os.environ[FLAGS].split()[2:] == OLDER_LOOPS.split()
+    assert os.environ[FLAGS] == str(tmp_path / "flags of ours")
+
+
 def test_a_step_compiles_once_whatever_part_of_its_state_came_from_a_checkpoint():
     """Arrays of a checkpoint are committed to their device, fresh ones are not; results of a mixture are."""
     of_checkpoint = jax.device_put(jnp.ones(3), jax.devices()[0])
