@@ -24,6 +24,7 @@ from experiments.core import runs
 from experiments.core.runner import main
 from experiments.faults.digests import digests
 from experiments.faults.trainings import PACKAGE
+from touchr1_jax.training.compilation import FLAGS, OLDER_LOOPS, xla_flags
 
 UNDISTURBED = "alone"  # name of the run that is not killed
 POLL_S = 0.005  # time between two looks at a session's files; a step takes longer
@@ -44,7 +45,6 @@ PHASES = (START, *STEPPING.values(), BETWEEN, CHECKPOINT)
 """Phases in which a kill can strike; between stages contacts are encoded, policies answer, the report is written."""
 
 _PRIOR_SHARE = 0.05  # share of a run by which the pace of the undisturbed one counts
-_FAST_COMPILATION = "--xla_cpu_use_fusion_emitters=false" if jax.__version_info__ < (0, 11) else ""
 _JAX_CONFIG = {
     "jax_disable_most_optimizations": True,
     "jax_compilation_cache_max_size": 2**30,  # never reached; but without a bound JAX takes no lock on what it writes
@@ -222,8 +222,8 @@ def _session(arguments: list[str], log: str, programs: str) -> None:
     file = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     for stream in (sys.stdout.fileno(), sys.stderr.fileno()):
         os.dup2(file, stream)
-    # read with the first program: the older of XLA's two code generators for a loop compiles twice as fast
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_FAST_COMPILATION}".strip()
+    # read with the first program
+    os.environ[FLAGS] = f"{xla_flags()} {OLDER_LOOPS}".strip()
     for name, value in (_JAX_CONFIG | {"jax_compilation_cache_dir": programs}).items():
         jax.config.update(name, value)
     sys.exit(main(arguments, package=PACKAGE))

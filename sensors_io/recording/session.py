@@ -366,5 +366,6 @@ def _stacked(samples: list[Sample], name: str, sensor: str, lacking: float = np.
     found = [np.asarray(s.arrays.get(name, np.full(3, lacking))) for s in samples]
     for x in found:
         if x.shape != (3,) or x.dtype.kind not in "fiu":
-            raise DeviceError(f"{name} of {sensor} has shape {x.shape}, type {x.dtype}: must be 3 numbers; correct it")
+            what = f"{name} of {sensor} has shape {x.shape}, type {x.dtype}"
+            raise DeviceError(f"{what}: must be 3 numbers; correct its driver")
     return np.array(found, np.float64).reshape(-1, 3)

@@ -138,7 +138,8 @@ class Stream:
             arrays = sample.arrays if sample.frame is None else {"frame": sample.frame, **sample.arrays}
             for name, x in arrays.items():
                 if (dtype := np.asarray(x).dtype).kind not in "biuf":
-                    raise DeviceDataError(f"{name} of {self.sensor} has type {dtype}: must be numbers; correct it")
+                    what = f"{name} of {self.sensor} has type {dtype}"
+                    raise DeviceDataError(f"{what}: must be numbers; correct its driver")
             journal.append("frame", plain, **arrays)
         self.frames += len(whole)
 

@@ -10,7 +10,7 @@
     noise = noise_bank(policy.fns, params, touch, seed=0)                                          encoding
     questions = QuestionFeed(policy, features, label, batch_size=config.drawn, seed=0)         questions
     score = make_score(policy.parser, make_rewards(prior), weights)                                rl.scoring, rewards
-    config, loop = GRPOConfig(), LoopConfig(steps=900)                                       rl.config, loop
+    config, loop = GRPOConfig(), LoopConfig(steps=900)                                             rl.config, loop
     params = train_grpo(policy, params, questions, score, config, loop, hooks, noise=noise, seed=0)   train_grpo
 
     evaluation = evaluate_policy(policy, params, test_features, test_label)                              evaluation

@@ -77,8 +77,8 @@ def compiled_quickly() -> Iterator[None]:
     the older loops.
     """
     flags, before = os.environ.get(FLAGS), jax.config.values["jax_disable_most_optimizations"]
-    if OLDER_LOOPS not in xla_flags():
-        os.environ[FLAGS] = f"{xla_flags()} {OLDER_LOOPS}".strip()
+    if OLDER_LOOPS not in (given := xla_flags()):
+        os.environ[FLAGS] = f"{given} {OLDER_LOOPS}".strip()
     jax.config.update("jax_disable_most_optimizations", True)
     try:
         yield

@@ -105,7 +105,7 @@ def test_lines_of_a_stage_that_has_ended_are_missed(context, kept):
 
 
 @pytest.mark.parametrize("name", ["._0.json", "0 (conflicted copy).json", ".~0.json"])
-def test_files_of_other_programs_beside_the_seals_are_passed_over(context, name):
+def test_files_of_other_programs_among_the_seals_are_passed_over(context, name):
     context.log("sft/0", 0, loss=1.0)
     context.seal_log("sft/0")
     sealed = context.directory / "stages" / "logged" / "sft" / "0.json"

@@ -132,7 +132,7 @@ def test_files_of_an_earlier_run_refuse_nobody_while_others_look_at_them(tmp_pat
         ended.join()
 
 
-def test_processes_may_spell_the_address_of_the_first_in_their_own_ways(tmp_path, monkeypatch):
+def test_each_process_may_spell_the_address_of_the_first_differently(tmp_path, monkeypatch):
     """Process 0 was given localhost; the file of its number is named so."""
     launch = Launch(distributed=True, coordinator="127.0.0.1:1", processes=2, process=1)
     monkeypatch.setattr(ProcessGroup, "broadcast", lambda group, choose: ".process-0-of-localhost:1")

@@ -72,13 +72,13 @@ def test_extract_writes_arrays_over_frames(real: pathlib.Path, tmp_path: pathlib
 def test_the_order_of_the_presses_changes_no_bit(presses: BallPresses) -> None:
     order = np.random.default_rng(2).permutation(len(presses))
     named = np.array(names(presses))
-    one, with_radii = calibrate(presses, tuple(named), "x", QUICK)
+    one, report = calibrate(presses, tuple(named), "x", QUICK)
     two, other = calibrate(presses.chosen(order), tuple(named[order]), "x", QUICK)
     assert one.hash == two.hash
     assert one.made_from == two.made_from
-    np.testing.assert_array_equal(with_radii.touches.stacked()[order], other.touches.stacked())
-    np.testing.assert_array_equal(with_radii.errors.depth_um[:, order], other.errors.depth_um)
-    assert [with_radii.kept[i] for i in order] == list(other.kept)
+    np.testing.assert_array_equal(report.touches.stacked()[order], other.touches.stacked())
+    np.testing.assert_array_equal(report.errors.depth_um[:, order], other.errors.depth_um)
+    assert [report.kept[i] for i in order] == list(other.kept)
 
 
 @pytest.mark.long

@@ -65,7 +65,7 @@ def naive_group(params, batch, i, touch, view, tokens):
 
 
 def close(ours, theirs, tolerance: float = 1e-5) -> None:
-    """Every leaf to a relative error of its own norm; a leaf that is 0 in truth must be small next to them."""
+    """Every leaf to a relative error of its own norm; one that is 0 in truth, of a thousandth of the largest."""
     scale = max(float(jnp.linalg.norm(x)) for x in jax.tree.leaves(theirs))
     for path, leaf in jax.tree_util.tree_leaves_with_path(theirs):
         found = dict(jax.tree_util.tree_leaves_with_path(ours))[path]
